@@ -1,15 +1,17 @@
 #!/bin/sh
-# Makes .venv with the project in it, by itself, on a fresh Debian or Ubuntu:  bootstrap.sh demo|lint|test|test-all|pictures|wheels|release
+# Creates .venv with the project on a fresh Debian or Ubuntu.
+#   bootstrap.sh demo|lint|test|test-all|pictures|wheels|release
 #   demo      the project
-#   lint      and its test tools
-#   test      and, where the kernel has no vcan for us, User Mode Linux, if we are root or sudo asks nothing; and small tools that
-#             some tests look through the eyes of
-#   test-all  and User Mode Linux in any case, systemd, a browser, an MQTT broker, the CANopen masters of others (tests/foreign)
-#   pictures  as `lint`, and a browser
-#   wheels    as `lint`, and cross compilers and qemu-user
-#   release   as `test`, and both virtual machines of the fault programme: User Mode Linux; QEMU with a kernel, 90 MB; clang, cross
-#             compilers and their QEMU; debootstrap and lintian
-# A second call does nothing. PYTHON: the interpreter to use.
+#   lint      the same and its test tools
+#   test      the same and small tools of some tests. If the kernel has no vcan for this user, also
+#             User Mode Linux, which needs root or a sudo without a password.
+#   test-all  the same, User Mode Linux in any case, systemd, a browser, an MQTT broker, and CANopen
+#             masters of other projects (tests/foreign)
+#   pictures  `lint` and a browser
+#   wheels    `lint`, cross compilers and qemu-user
+#   release   `test` and both virtual machines of the fault programme, which are User Mode Linux and
+#             QEMU with a kernel (90 MB); clang, cross compilers and their QEMU; debootstrap, lintian
+# A second call has no effect. PYTHON is the interpreter to use.
 set -eu
 
 what=${1:?demo, lint, test, test-all, pictures, wheels or release}
@@ -23,7 +25,7 @@ die() { say "$@"; exit 1; }
 can_root() { command -v apt-get >/dev/null && { [ "$(id -u)" = 0 ] || sudo -n true 2>/dev/null; }; }
 as_root() { if [ "$(id -u)" = 0 ]; then "$@"; else sudo -n "$@"; fi; }
 
-# Without rights to install: what is left out, said in one line at the end.
+# Collects programs that this user may not install. One line reports them at the end.
 left_out=
 lacks=
 lacking() { # $1: packages, $2: for what
@@ -73,13 +75,13 @@ make_venv() {
 
 install_project() { # $1: demo or test, $2: what pip installs
     stamp=.venv/.installed-$1
-    key="$(cat pyproject.toml hatch_build.py kontronik_can_gw/native/*.[ch] | cksum) $(command -v cc || command -v gcc || :) $PWD"
+    key="$(cat pyproject.toml hatch_build.py kontronik_can_gw/native/*.[ch] kontronik_can_gw/esc/kontronik/*.py | cksum) $(command -v cc || command -v gcc || :) $PWD"
     for done in "$stamp" .venv/.installed-test; do
         [ -e "$done" ] && [ "$(cat "$done")" = "$key" ] && return
     done
     "$venv" -m pip --version >/dev/null 2>&1 || "$venv" -m ensurepip >/dev/null || die "no pip in .venv"
     say "the project and what it needs (pip install -e $2)"
-    # PIP_USE_PEP517: an old pip builds by setup.py otherwise, and warns
+    # Without PIP_USE_PEP517 an old pip builds by setup.py and warns.
     PIP_USE_PEP517=1 "$venv" -m pip install -q --disable-pip-version-check --no-input -e "$2" >&2 </dev/null || die "pip failed"
     echo "$key" >"$stamp"
 }
@@ -87,8 +89,9 @@ install_project() { # $1: demo or test, $2: what pip installs
 vm_packages="user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
 vm_line="sudo apt-get install $vm_packages"
 
-# What another user has installed is used without rights to install.
-# User Mode Linux 6.1 does not know the registers of the newest processors: there it starts with the help of uml_xstate.c.
+# Programs that are installed already need no rights.
+# User Mode Linux 6.1 does not support the registers of the newest processors. It needs uml_xstate.c
+# to start there.
 install_uml() {
     key=$(cksum <tests/vm/uml_xstate.c)
     command -v linux.uml >/dev/null && [ "$(cat .venv/.uml-starts 2>/dev/null)" = "$key" ] && return
@@ -117,7 +120,7 @@ install_vcan() {
         tests/vm/setup.sh || { say "failed; by hand:  $vm_line"; return; }
     fi
     has_vcan && return
-    extra=linux-modules-extra-$(uname -r) # Ubuntu has vcan in there
+    extra=linux-modules-extra-$(uname -r) # Ubuntu's package with vcan
     if can_root && apt_update && apt-cache show "$extra" >/dev/null 2>&1; then
         say "$extra (vcan)"
         as_root env DEBIAN_FRONTEND=noninteractive DEBCONF_NOWARNINGS=yes apt-get -qq -o DPkg::Lock::Timeout=120 \
@@ -134,7 +137,8 @@ has_vcan() { # natively, or by a VM other than User Mode Linux
     case $("$venv" -B tests/vm/vm_run.py --which) in native | qemu) ;; *) false ;; esac
 }
 
-# install_programs WHY PROGRAM[=PACKAGES]...: the packages of those that are not there, one by one: what cannot be had is left out.
+# install_programs WHY PROGRAM[=PACKAGES]...
+# Installs the packages of missing programs one by one. A package that cannot be installed is left out.
 install_programs() {
     PATH=$PATH:/usr/sbin:/sbin
     why=$1
@@ -159,7 +163,7 @@ install_clang() { install_programs "a second C compiler, with a fuzzer" clang=cl
 
 install_browser() { command -v google-chrome >/dev/null || install_programs "a browser" chromium; }
 
-# The faults that set clocks and mount file systems are never tried on the machine itself.
+# Faults that set clocks and mount file systems never run on the machine itself.
 install_vm() { # $1: uml or qemu
     PATH=$PATH:/usr/sbin:/sbin
     case $1 in
@@ -172,7 +176,7 @@ install_vm() { # $1: uml or qemu
     tests/vm/setup.sh "$1" || say "failed; by hand:  sudo tests/vm/setup.sh $1"
 }
 
-# With a C compiler the core in C is built when the project is installed; without one the core in Python runs.
+# With a C compiler the C core is built when the project is installed. Otherwise the Python core runs.
 install_compiler() { command -v cc >/dev/null || command -v gcc >/dev/null || install_programs "a C compiler" gcc=gcc,libc6-dev; }
 
 install_other_machines() {
@@ -193,7 +197,7 @@ case $what in
     test) install_compiler; install_project test '.[test]'; install_vcan; install_small_tools ;;
     test-all)
         install_compiler
-        # a minute of a processor, beside what comes over the network; what fails is said by the call below
+        # This needs a minute of processor time besides the downloads. The call below reports failures.
         tests/foreign/install.sh masters 2>/dev/null &
         install_project test '.[test]'
         install_vcan

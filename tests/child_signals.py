@@ -1,14 +1,17 @@
 """Gives child processes the default signal dispositions, whatever started this process.
 
-`nohup` ignores SIGHUP, and a shell ignores SIGINT and SIGQUIT for a job in the background. A child inherits an
-ignored or blocked signal, and then never reacts to the signal that a test sends to it.
+`nohup` ignores SIGHUP, and a shell ignores SIGINT and SIGQUIT for a job in the background. A child
+inherits an ignored or blocked signal, and then never reacts to the signal that a test sends to it.
 """
 
 import signal
 from types import FrameType
 
 _SIGNALS = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGCHLD)
-"""Signals that a parent can have ignored. Python sets SIGPIPE, and `subprocess` resets it in each child."""
+"""Signals that a parent may ignore.
+
+Python sets SIGPIPE itself, and `subprocess` resets it in each child.
+"""
 
 
 def _ignore(_number: int, _frame: FrameType | None) -> None:

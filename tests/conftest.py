@@ -1,6 +1,8 @@
-"""python-can comes first, and asammdf with it: the gateway's own code keeps that out, for the rest of the process.
+"""Fixtures and settings of all tests.
 
-On a vcan neither is wanted so early.
+python-can is imported first, and asammdf with it. The gateway's own code imports python-can
+without asammdf, and the rest of the process would then lack it. Tests on a vcan import neither
+so early.
 """
 
 import gc
@@ -15,10 +17,11 @@ from child_signals import use_defaults_in_children
 
 use_defaults_in_children()
 
-# India's local time, without a data base of zones: on a machine whose local time is UTC no test
-# would notice that the two are exchanged.
 LOCAL_ZONE = "IST-5:30"
-"""Local time of all tests. It is not UTC, so that a test sees if the two are exchanged."""
+"""Local time of all tests: India's, written so that no database of zones is needed.
+
+If it were UTC, no test would notice that local time and UTC are exchanged.
+"""
 os.environ["TZ"] = LOCAL_ZONE
 time.tzset()
 
@@ -26,42 +29,57 @@ if not os.environ.get("KCG_VCAN"):
     import can  # noqa: F401
     from hypothesis import HealthCheck, settings
 
-    # the same examples in every run, and none is judged by how long it took
+    # Every run uses the same examples, and the duration of an example is not judged.
     settings.register_profile(
-        "suite", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+        "suite",
+        deadline=None,
+        derandomize=True,
+        suppress_health_check=[HealthCheck.too_slow],
     )
     settings.load_profile("suite")
 
 
 def pytest_collection_finish() -> None:
-    """What was imported stays: a collection that walks through pandas and its like holds a gateway in this process up for long."""
+    """Exclude the imported modules from garbage collection.
+
+    A collection that walks through large libraries such as pandas would hold up a gateway in this
+    process for a long time.
+    """
     gc.collect()
     gc.freeze()
 
 
 TESTS = Path(__file__).parent
 ON_BOTH_CORES = (
-    *("gateway", "golden/test_golden.py::test_no_frame_has_changed"),
-    *("dbc/test_schedule_and_messages.py", "dbc/test_binding.py"),
-    *("capture/test_replay_is_identical.py", "canopen/test_outages_and_order.py"),
-    *("canopen/test_dialogues.py", "canopen/test_sync_at_once.py", "runtime/test_hold_ups.py"),
-    *("runtime/test_esc_input.py", "runtime/test_snapshot.py"),
-    *("recordings/test_plain_bytes.py", "recordings/test_tables.py"),
+    "gateway",
+    "golden/test_golden.py::test_no_frame_has_changed",
+    "dbc/test_schedule_and_messages.py",
+    "dbc/test_binding.py",
+    "capture/test_replay_is_identical.py",
+    "canopen/test_outages_and_order.py",
+    "canopen/test_dialogues.py",
+    "canopen/test_sync_at_once.py",
+    "runtime/test_hold_ups.py",
+    "runtime/test_esc_input.py",
+    "runtime/test_snapshot.py",
+    "recordings/test_plain_bytes.py",
+    "recordings/test_tables.py",
 )
-"""Tests of what the core does, folders, files or single ones: they run on the core in C and on the one in Python."""
+"""Tests of the core, given as folders, files or single tests. They run on both cores."""
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run the tests of the core on both."""
+    """Run the tests of the core on the core in C and on the core in Python."""
     file = Path(str(metafunc.module.__file__)).relative_to(TESTS)
-    places = (*map(str, (file, *file.parents)), f"{file}::{metafunc.function.__name__}")
+    places = [str(file), f"{file}::{metafunc.function.__name__}"]
+    places += [str(folder) for folder in file.parents]
     if any(place in ON_BOTH_CORES for place in places):
         metafunc.parametrize("core_language", ["C", "Python"], indirect=True)
 
 
 @pytest.fixture(autouse=True)
 def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Which core every gateway of the test gets: the one named, where one is."""
+    """Give every gateway of the test the core of this language, if the test names one."""
     language = getattr(request, "param", "")
     if not language:
         yield ""
@@ -79,15 +97,21 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
 
 
 OF_SYSTEMD = (
-    *("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "JOURNAL_STREAM", "INVOCATION_ID"),
-    *("RUNTIME_DIRECTORY", "STATE_DIRECTORY", "XDG_STATE_HOME"),
+    "NOTIFY_SOCKET",
+    "WATCHDOG_USEC",
+    "WATCHDOG_PID",
+    "JOURNAL_STREAM",
+    "INVOCATION_ID",
+    "RUNTIME_DIRECTORY",
+    "STATE_DIRECTORY",
+    "XDG_STATE_HOME",
 )
-"""Set where the tests run in a service; the gateway would take them as its own."""
+"""Variables that systemd sets for a service. A gateway would take them for its own."""
 OF_TERMINALS = ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "CLICOLOR_FORCE")
 
 
 def clear_environment(patch: pytest.MonkeyPatch) -> None:
-    """Removes variables that change how the gateway runs or prints. Sets one zone and the usual umask."""
+    """Remove variables that change how the gateway runs or prints. Set zone and umask."""
     for name in (*OF_SYSTEMD, *OF_TERMINALS):
         patch.delenv(name, raising=False)
     patch.setenv("TZ", LOCAL_ZONE)
@@ -97,13 +121,13 @@ def clear_environment(patch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True, scope="session")
 def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Makes the tests independent of how this machine is set up.
+    """Make the tests independent of how this machine is set up.
 
     - No variables that change how the gateway runs or prints, one zone as local time, umask 022.
     - A machine id: containers and fresh roots have none, and the configuration warns about that.
     - No configuration in /etc: an installed gateway has one.
-    - A runtime folder of their own, for this process and its children. A user without a session
-      has none, and a gateway of the system must not meet the locks of the tests.
+    - A separate runtime folder for this process and its children. A user without a session has
+      no such folder, and a gateway of the system must not meet the locks of the tests.
     """
     from kontronik_can_gw.cli import arguments
     from kontronik_can_gw.runtime.system import folders, machine
@@ -123,10 +147,11 @@ def plain_machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def native_library(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The core in C, optimised, for any layout; no warning of the compiler."""
+    """Compile the optimised C core, which serves any layout. A compiler warning is an error."""
     from built import STRICT, built
 
     from kontronik_can_gw.native.binding import load
     from kontronik_can_gw.native.objects import OPTIONS
 
-    return load(built(tmp_path_factory.mktemp("native") / "core.so", *STRICT, "-O2", *OPTIONS))
+    library = tmp_path_factory.mktemp("native") / "core.so"
+    return load(built(library, *STRICT, "-O2", *OPTIONS))

@@ -1,18 +1,34 @@
-"""Runs one tier of the project's checks: what `make test`, `make test-all` and `make release` call.
+"""Runs one tier of the project's checks. `make test`, `make test-all` and `make release` call it.
 
     python tests/run.py test|test-all|release [--only STEP]... [-- PYTEST-ARGUMENTS...]
 
-test      lint (ruff), types (mypy), unit (pytest on this machine), vcan (pytest on a real vcan: this kernel's, or a VM's)
-test-all  what `test` leaves out: faults (the fault programme in User Mode Linux) and, by the marker "extended", tools (the service
-          under a real systemd, a browser, a broker ...) and masters (CANopen masters of others, and more, on a vcan).
-          tools repeats the tests marked "rights": CI runs `test` as an ordinary user and `test-all` as root
-release   by hand, on a quiet machine: qemu (the fault programme on emulated hardware), soak (random faults), hour (recorded),
-          put-in (a list of faults that the tests must see), machines (the exported core on other machines),
-          fuzz (the core in C under fuzzers, ten minutes each), wheels, deb (the Debian packages in fresh roots of both releases)
+test, before every commit:
+  lint      ruff
+  types     mypy
+  unit      pytest on this machine
+  vcan      pytest on a real vcan of this kernel or of a virtual machine
 
-The lanes of a tier run side by side. A step runs once, and what it prints appears when it ends. Exit code 0: all that ran has
-passed. What could not be run is listed with the line that enables it; with CI=true that and each skipped test is a failure. The
-last line has the totals, `N passed, M failed, K skipped`.
+test-all, the slow checks and the checks with other programs:
+  faults    the fault programme in User Mode Linux
+  tools     tests marked "extended": the service under a real systemd, a browser, a broker ...
+            It repeats the tests marked "rights": CI runs `test` as an ordinary user and
+            `test-all` as root.
+  masters   tests marked "extended" on a vcan, with CANopen masters of other projects
+
+release, by hand on a quiet machine:
+  qemu      the fault programme on emulated hardware
+  soak      random faults
+  hour      a recorded hour
+  put-in    a list of faults that the tests must detect
+  machines  the exported core on other machines
+  fuzz      the C core under fuzzers, ten minutes each
+  wheels    wheels for other machines
+  deb       the Debian packages in fresh roots of both releases
+
+The lanes of a tier run side by side. A step runs once, and its output appears when it ends.
+The exit code is 0 if every step that ran has passed. A step that could not run is listed with
+the command that enables it. With CI=true such a step and each skipped test is a failure. The last
+line has the totals: `N passed, M failed, K skipped`.
 """
 
 import argparse
@@ -41,11 +57,15 @@ PATH = os.pathsep.join(
     [str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"]
 )
 MESSAGE = 2000
-"""Characters of a failed test's message that the summary repeats, for who sees no more than the end of the output."""
+"""Characters of a failed test's message in the summary, for readers of only the output's end."""
 
 PYTEST = "python -m pytest -q --junitxml={report}"
-ON_VCAN = f"KCG_VCAN=1 HYPOTHESIS_STORAGE_DIRECTORY={{scratch}} python tests/vm/vm_run.py --timeout=1500 --rw={{scratch}} -- {PYTEST} "
-ON_VCAN += "-p no:cacheprovider tests/vcan"
+ON_VCAN = (
+    "KCG_VCAN=1 HYPOTHESIS_STORAGE_DIRECTORY={scratch} "
+    "python tests/vm/vm_run.py --timeout=1500 --rw={scratch} -- "
+    f"{PYTEST} -p no:cacheprovider tests/vcan"
+)
+FUZZ_OPTIONS = "-s -o faulthandler_timeout=900"
 FAULTS = "python tests/faults/programme.py {0} --junit={{report}}"
 STEPS = {
     "lint": "ruff check . && ruff format --check .",
@@ -61,7 +81,7 @@ STEPS = {
     "put-in": "python tests/mutants/put_in_faults.py",
     "wheels": "python tests/native/wheels.py {scratch}",
     "machines": f"{PYTEST} -s tests/native/on_machines.py",
-    "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} -s -o faulthandler_timeout=900 tests/native/test_fuzz.py",
+    "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} {FUZZ_OPTIONS} tests/native/test_fuzz.py",
     "deb": f"{PYTEST} -o faulthandler_timeout=900 tests/deb/in_fresh_roots.py",
 }
 TIERS = {
@@ -70,20 +90,22 @@ TIERS = {
     "release": (("qemu", "soak", "hour", "put-in", "machines", "fuzz", "wheels", "deb"),),
 }
 LIMIT_S = {"test": 1800, "test-all": 2400, "release": 6 * 3600}
-"""Of one step: the two that CI runs end within its 90 minutes whatever happens."""
+"""Longest duration of one step. The two tiers that CI runs end within its 90 minutes."""
 ENABLE_UML = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
 ENABLE_CROSS = (
-    "sudo apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi gcc-arm-linux-gnueabihf libc6-dev-armhf-cross "
-    "gcc-aarch64-linux-gnu libc6-dev-arm64-cross gcc-s390x-linux-gnu libc6-dev-s390x-cross qemu-system-arm qemu-user"
+    "sudo apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi "
+    "gcc-arm-linux-gnueabihf libc6-dev-armhf-cross gcc-aarch64-linux-gnu libc6-dev-arm64-cross "
+    "gcc-s390x-linux-gnu libc6-dev-s390x-cross qemu-system-arm qemu-user"
 )
-ENABLE_VCAN = (
-    f"{ENABLE_UML}  (or, on Ubuntu, linux-modules-extra-{platform.release()} can-utils iproute2)"
-)
+UBUNTU_MODULES = f"linux-modules-extra-{platform.release()}"
+ENABLE_VCAN = f"{ENABLE_UML}  (or, on Ubuntu, {UBUNTU_MODULES} can-utils iproute2)"
 WHEELS = "aarch64-linux-gnu-gcc arm-linux-gnueabihf-gcc qemu-arm"
 ENABLE_WHEELS = "gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user"
 NEEDS = {
-    **dict.fromkeys(("vcan", "masters"), ("ip candump vcan", ENABLE_VCAN)),
-    **dict.fromkeys(("faults", "soak"), ("linux.uml cc", ENABLE_UML)),
+    "vcan": ("ip candump vcan", ENABLE_VCAN),
+    "masters": ("ip candump vcan", ENABLE_VCAN),
+    "faults": ("linux.uml cc", ENABLE_UML),
+    "soak": ("linux.uml cc", ENABLE_UML),
     "qemu": ("qemu-system-x86_64", "sudo tests/vm/setup.sh qemu"),
     "wheels": (WHEELS, f"sudo apt-get install {ENABLE_WHEELS}"),
     "machines": (
@@ -96,7 +118,10 @@ NEEDS = {
         f"{ENABLE_UML} debootstrap lintian {ENABLE_WHEELS}",
     ),
 }
-"""What a step needs besides Python, "vcan" being a kernel with one, and the line that enables it."""
+"""Programs that a step needs besides Python, and the command that installs them.
+
+"vcan" means a kernel that has vcan interfaces.
+"""
 
 printing = threading.Lock()
 running: set[subprocess.Popen[bytes]] = set()
@@ -104,14 +129,14 @@ running: set[subprocess.Popen[bytes]] = set()
 
 @dataclass
 class Result:
-    """What came of a step. One without a JUnit report counts as one check."""
+    """The result of a step. A step without a JUnit report counts as one check."""
 
     step: str
     seconds: float = 0.0
     passed: int = 0
     failed: int = 0
     skipped: list[tuple[str, str]] = field(default_factory=list)
-    """Name and reason of each."""
+    """Name and reason of each skipped test."""
     failures: list[str] = field(default_factory=list)
     """Name and message of each failed test of a JUnit report."""
     note: str = ""
@@ -119,7 +144,9 @@ class Result:
 
     @property
     def state(self) -> str:
-        return "not run" if self.enable else "FAILED" if self.failed else "passed"
+        if self.enable:
+            return "not run"
+        return "FAILED" if self.failed else "passed"
 
 
 def read_report(report: Path, result: Result) -> None:
@@ -138,7 +165,7 @@ def read_report(report: Path, result: Result) -> None:
 
 
 def missing(step: str) -> str:
-    """What a step needs and is not there."""
+    """Return the first requirement of a step that this machine lacks, or ""."""
     for program in NEEDS.get(step, ("", ""))[0].split():
         if program == "vcan":
             which = ["python", "tests/vm/vm_run.py", "--which"]
@@ -149,11 +176,18 @@ def missing(step: str) -> str:
     return ""
 
 
-def run(step: str, limit_s: float, scratch: Path, arguments: Sequence[str], live: bool) -> Result:
-    """Run a step; its output comes at once if ``live``, else as a whole at its end."""
+def run(
+    step: str,
+    limit_s: float,
+    scratch: Path,
+    arguments: Sequence[str],
+    live: bool,
+) -> Result:
+    """Run a step. Its output appears immediately if ``live``, otherwise when the step ends."""
     result = Result(step)
     if lacking := missing(step):
-        result.note, result.enable = f"there is no {lacking}", NEEDS[step][1]
+        result.note = f"there is no {lacking}"
+        result.enable = NEEDS[step][1]
         return result
     report = scratch / f"{step}.xml"
     words = {"report": report, "scratch": scratch}
@@ -187,7 +221,8 @@ def run(step: str, limit_s: float, scratch: Path, arguments: Sequence[str], live
         with printing:
             print("" if live else printed, flush=True)
     if "{report}" not in STEPS[step]:
-        result.passed, result.failed = int(not code), int(bool(code))
+        result.passed = int(not code)
+        result.failed = int(bool(code))
     elif report.exists():
         read_report(report, result)
     nothing_chosen = code == 5 and arguments
@@ -198,7 +233,10 @@ def run(step: str, limit_s: float, scratch: Path, arguments: Sequence[str], live
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
-    """End a step and all that it has started; a virtual machine is given the time to do so itself."""
+    """End a step and all processes that it has started.
+
+    A virtual machine has 15 s to shut down by itself.
+    """
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGTERM)
         try:
@@ -211,17 +249,16 @@ def leave(folder: str, number: int) -> NoReturn:
     for process in list(running):
         end(process)
     shutil.rmtree(folder, ignore_errors=True)
-    os._exit(128 + number)  # or the lanes would go on with their next steps
+    os._exit(128 + number)  # otherwise the lanes would continue with their next steps
 
 
 def summarize(results: Sequence[Result], strict: bool) -> int:
-    """Print the summary; the exit code of it all."""
+    """Print the summary. Return the exit code of the whole run."""
     print("\n== summary")
     for result in results:
         counts = f"{result.passed} passed, {result.failed} failed, {len(result.skipped)} skipped"
-        print(
-            f"{result.step:8}{result.state:8} {result.seconds:7.1f} s  {counts}  {result.note}".rstrip()
-        )
+        head = f"{result.step:8}{result.state:8} {result.seconds:7.1f} s"
+        print(f"{head}  {counts}  {result.note}".rstrip())
     skipped = [each for result in results for each in result.skipped]
     unrun = [result for result in results if result.enable]
     for result in unrun:
@@ -233,21 +270,23 @@ def summarize(results: Sequence[Result], strict: bool) -> int:
         print(f"failed: {failure[:MESSAGE]}")
     if strict and (unrun or skipped):
         print("CI=true: what was not run is a failure")
+    passed = sum(result.passed for result in results)
     failed = sum(result.failed for result in results)
-    print(
-        f"{sum(result.passed for result in results)} passed, {failed} failed, {len(skipped)} skipped",
-        flush=True,
-    )
-    return int(bool(failed or (strict and (unrun or skipped))))
+    print(f"{passed} passed, {failed} failed, {len(skipped)} skipped", flush=True)
+    is_incomplete = strict and (unrun or skipped)
+    return int(bool(failed or is_incomplete))
 
 
 def main() -> int:
-    own, arguments = sys.argv[1:], list[str]()
+    own = sys.argv[1:]
+    arguments = list[str]()
     if "--" in own:
         at = own.index("--")
-        own, arguments = own[:at], own[at + 1 :]
+        arguments = own[at + 1 :]
+        own = own[:at]
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("tier", choices=TIERS)
     parser.add_argument("--only", action="append", choices=STEPS, metavar="STEP")
@@ -258,9 +297,8 @@ def main() -> int:
     ]
     lanes = [lane for lane in lanes if lane]
     if not lanes:
-        parser.error(
-            f"{args.tier} has the steps {', '.join(step for lane in TIERS[args.tier] for step in lane)}"
-        )
+        steps = [step for lane in TIERS[args.tier] for step in lane]
+        parser.error(f"{args.tier} has the steps {', '.join(steps)}")
     os.environ["PATH"] = PATH
     with tempfile.TemporaryDirectory(prefix="kcg-test.", ignore_cleanup_errors=True) as folder:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

@@ -1,4 +1,7 @@
-"""The tests do not depend on how they were started: under nohup, in the background, or without a session."""
+"""The tests do not depend on how they were started.
+
+They may run under nohup, in the background, or without a session.
+"""
 
 import os
 import re
@@ -12,8 +15,10 @@ from kontronik_can_gw.runtime.system.folders import runtime_folder
 
 TESTS = Path(__file__).parent
 IGNORING = ["sh", "-c", 'trap "" HUP INT QUIT; exec "$@"', "sh", sys.executable, "-c"]
-"""Starts Python as nohup and a shell's background job do, with these signals ignored."""
-HUP, INT, QUIT = 1, 2, 3
+"""Command that starts Python as nohup and a shell's background job do: it ignores signals."""
+HUP = 1
+INT = 2
+QUIT = 3
 
 
 def run_ignoring(script: str) -> subprocess.CompletedProcess[str]:
@@ -38,13 +43,19 @@ def test_children_of_tests_have_default_signals_under_nohup() -> None:
         assert not any(int(found[1], 16) >> (number - 1) & 1 for number in (HUP, INT, QUIT))
 
 
-def test_tests_themselves_go_on_ignoring_a_hangup_under_nohup() -> None:
+def test_tests_still_ignore_a_hangup_under_nohup() -> None:
     script = "import conftest, os, signal; os.kill(os.getpid(), signal.SIGHUP); print('alive')"
     assert run_ignoring(script).stdout == "alive\n"
 
 
-@pytest.mark.parametrize(("ignored", "code"), [(True, 0), (False, 128 + HUP)])
-def test_make_test_goes_on_after_a_hangup_only_under_nohup(ignored: bool, code: int) -> None:
+@pytest.mark.parametrize(
+    ("ignored", "code"),
+    [
+        (True, 0),
+        (False, 128 + HUP),
+    ],
+)
+def test_make_test_continues_after_a_hangup_only_under_nohup(ignored: bool, code: int) -> None:
     script = (
         "import run, sys; run.STEPS['lint'] = 'kill -HUP $PPID; sleep 0.1'; "
         "sys.argv = ['run.py', 'test', '--only', 'lint']; sys.exit(run.main())"
@@ -54,11 +65,17 @@ def test_make_test_goes_on_after_a_hangup_only_under_nohup(ignored: bool, code: 
         assert done.stdout.endswith("1 passed, 0 failed, 0 skipped\n")
     else:
         command = [sys.executable, "-c", script]
-        done = subprocess.run(command, cwd=TESTS, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command,
+            cwd=TESTS,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     assert done.returncode == code, done.stderr
 
 
-def test_the_environment_of_a_service_and_a_time_zone_do_not_reach_tests() -> None:
+def test_variables_of_a_service_and_its_time_zone_do_not_reach_tests() -> None:
     script = (
         "import os; os.umask(0o077); "
         "import conftest, os, pytest, time; conftest.clear_environment(pytest.MonkeyPatch()); "

@@ -1,7 +1,9 @@
-"""What a gateway has imported: the real ``run`` command on a stand-in of a CAN interface, looked at when it has sent values.
+"""A running gateway imports only the listed libraries.
 
-A gateway on a small board pays for each library in time and memory, and libraries bring others: python-can brings asammdf where it is
-installed. So what may be there is listed. And cantools, which comes without python-can, is whole for who asks for more of it.
+The real ``run`` command runs with a replacement for its CAN interface. Its modules are listed
+after it has sent values. A gateway on a small board pays for each library in time and memory, and
+libraries import others: python-can imports asammdf if it is installed. The gateway imports
+cantools without python-can. A program that then uses more of cantools still finds all of it.
 """
 
 import os
@@ -23,12 +25,12 @@ STANDIN = Path(__file__).resolve().parent / "benchmarks"
 
 CANTOOLS = {"cantools", "argparse_addons", "bitstruct", "textparser", "crccheck", "diskcache"}
 ALWAYS = {"kontronik_can_gw", "serial"}
-"""Libraries that every gateway may have."""
+"""Libraries that every gateway may import."""
 OWN = {"cli": {"run", "common", "arguments", "recording"}, "desk": set[str]()}
-"""Of our own rooms that are large, what may be there; the others are the gateway itself."""
+"""Modules of the package's large folders that may be imported. Other folders are unrestricted."""
 NEVER = {"tkinter", "curses", "multiprocessing", "unittest", "pydoc", "doctest", "asyncio", "ssl"}
 NEVER |= {"sqlite3", "email"}
-"""Of the standard library."""
+"""Modules of the standard library that a gateway does not import."""
 NODES = '[canopen]\nenabled = true\nself_start = true\nnode_id = 1\nstore = "store"\n'
 CANOPEN = {"kontronik_can_gw.canopen", "kontronik_can_gw.runtime.files.store"}
 RECORDER = {
@@ -42,7 +44,10 @@ CONFIGURATIONS = {
     "recorder": ('[record]\ndirectory = "captures"\n', CANTOOLS, RECORDER),
     "status": ('[statistics]\nfile = "status.json"\n', CANTOOLS, set[str]()),
 }
-"""Tables, the libraries that come with them, and of our own modules those that are there only with some of the tables."""
+"""Tables of the configuration, the libraries that they need, and their optional own modules.
+
+An optional module is one that is imported only with some of the tables.
+"""
 
 AT_THE_END = """
 import atexit, sys
@@ -57,15 +62,20 @@ locks.PREFIX += "{bus}/"  # tests may run side by side, all on "lo"
 
 def write():
     with open({file!r}, "w") as file:
-        file.write("\\n".join(sorted(name for name, module in sys.modules.items() if module is not None)))
+        names = sorted(name for name, module in sys.modules.items() if module is not None)
+        file.write("\\n".join(names))
 
 atexit.register(write)
 """
 
 
 def imported(folder: Path, tables: str, extra: str = "") -> set[str]:
-    """The modules of a gateway with these tables that has sent values of an ESC; ``extra`` is run in it at its start."""
-    bus, names = f"kontronik-test-{os.getpid()}-{time.monotonic_ns()}", folder / "names"
+    """Return the modules of a gateway with these tables after it has sent values of an ESC.
+
+    The code ``extra`` runs in its process at the start.
+    """
+    bus = f"kontronik-test-{os.getpid()}-{time.monotonic_ns()}"
+    names = folder / "names"
     (folder / "sitecustomize.py").write_text(
         AT_THE_END.format(standin=str(STANDIN), extra=extra, bus=bus, file=str(names))
     )
@@ -97,7 +107,7 @@ def imported(folder: Path, tables: str, extra: str = "") -> set[str]:
 
 
 def _until_values(peer: socket.socket, esc: PtyEsc) -> None:
-    """Feed the ESC's frames until its voltage, 24.42 V, is on the bus: by a DBC message, or by a PDO."""
+    """Send frames of the ESC until its voltage, 24.42 V, is on the bus in a message or a PDO."""
     until = time.monotonic() + 60
     while time.monotonic() < until:
         esc.write(LIVE)
@@ -111,21 +121,21 @@ def _until_values(peer: socket.socket, esc: PtyEsc) -> None:
 
 
 def surplus(modules: set[str], allowed: set[str]) -> set[str]:
-    """Modules that are neither of the standard library nor allowed."""
+    """Return the modules that are neither in the standard library nor allowed."""
     libraries = {name.partition(".")[0] for name in modules}
     found = {
         name
         for name in libraries - allowed
         if name not in sys.stdlib_module_names and not name.startswith("_")
     }
-    for room, may in OWN.items():
-        of_room = {name for name in modules if name.startswith(f"kontronik_can_gw.{room}.")}
-        found |= {name for name in of_room if name.split(".")[2] not in may}
+    for folder, may in OWN.items():
+        in_folder = {name for name in modules if name.startswith(f"kontronik_can_gw.{folder}.")}
+        found |= {name for name in in_folder if name.split(".")[2] not in may}
     return found - {"sitecustomize", "standin", "distutils-precedence"}
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_a_running_gateway_has_what_it_needs_and_no_more(name: str, tmp_path: Path) -> None:
+def test_a_running_gateway_imports_only_the_listed_modules(name: str, tmp_path: Path) -> None:
     tables, further, own = CONFIGURATIONS[name]
     modules = imported(tmp_path, tables)
     assert "kontronik_can_gw.runtime.loop" in modules
@@ -134,10 +144,12 @@ def test_a_running_gateway_has_what_it_needs_and_no_more(name: str, tmp_path: Pa
     assert modules & (CANOPEN | RECORDER) == own
 
 
-def test_the_list_can_fail(tmp_path: Path) -> None:
-    """With a library and a room of ours that do not belong there, imported on purpose."""
+def test_a_module_that_is_not_listed_is_found(tmp_path: Path) -> None:
+    """The test imports a library and a module of ours that a gateway does not need."""
     modules = imported(
-        tmp_path, "", "import rich.console, kontronik_can_gw.desk.recordings.layouts"
+        tmp_path,
+        "",
+        "import rich.console, kontronik_can_gw.desk.recordings.layouts",
     )
     found = surplus(modules, ALWAYS | CANTOOLS)
     assert {"rich", "kontronik_can_gw.desk.recordings.layouts"} <= found
@@ -145,6 +157,9 @@ def test_the_list_can_fail(tmp_path: Path) -> None:
 
 LEAN = "import sys; from kontronik_can_gw.light_imports import without_asammdf\n"
 DATABASE = f"{LEAN}with without_asammdf(): import cantools.database\n"
+AFTERWARDS = f"""{LEAN}with without_asammdf(): import can
+print('asammdf' in sys.modules); import asammdf
+"""
 WHOLE = f"""{DATABASE}
 import cantools
 before = cantools.database
@@ -159,17 +174,14 @@ print(cantools.tester.Tester.__name__, before is cantools.database, 'can' in sys
     [
         (WHOLE, "True False Error\nTester True True"),
         (f"import cantools; before = cantools\n{DATABASE}print(before is cantools)", "True"),
-        (
-            f"{LEAN}with without_asammdf(): import can\nprint('asammdf' in sys.modules); import asammdf",
-            "False",
-        ),
+        (AFTERWARDS, "False"),
     ],
     ids=[
-        "cantools is whole for who asks for more",
-        "a cantools that is there already stays",
+        "cantools is complete when more of it is imported",
+        "a cantools that was imported before is kept",
         "asammdf can be imported afterwards",
     ],
 )
-def test_libraries_come_alone_and_whole(code: str, said: str) -> None:
+def test_libraries_are_imported_without_others_and_remain_complete(code: str, said: str) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, said), done.stderr

@@ -1,4 +1,7 @@
-"""What ``make test`` makes of its steps: nothing that failed, was not run or left no report passes for good, and nothing is run twice."""
+"""``make test`` runs each step once and judges it by its report and its exit code.
+
+A step that failed, did not run or left no report never counts as passed.
+"""
 
 import re
 from pathlib import Path
@@ -17,9 +20,16 @@ CASES = {
 
 @pytest.fixture
 def step(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    """A function that runs a shell command as the step "unit"; with ``cases`` it leaves a report."""
+    """Return a function that runs a shell command as the step "unit".
 
-    def run(command: str, *cases: str, arguments: tuple[str, ...] = ()) -> Any:
+    With ``cases`` the step leaves a report of them.
+    """
+
+    def run(
+        command: str,
+        *cases: str,
+        arguments: tuple[str, ...] = (),
+    ) -> Any:
         report = tmp_path / "made.xml"
         report.write_text(f"<testsuite>{''.join(CASES[case] for case in cases)}</testsuite>")
         copy = f"cp {report} {{report}}; " if cases else ": {report}; "
@@ -40,19 +50,24 @@ def step(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
         ("exit 3", ["passed"], (1, 1, 0), "FAILED"),
         ("exit 2", [], (0, 1, 0), "FAILED"),
         ("true", [], (0, 1, 0), "FAILED"),
-        ("exit 5", [], (0, 0, 0), "passed"),  # a choice that fits none of its tests
+        ("exit 5", [], (0, 0, 0), "passed"),  # the chosen expression matches no test
     ],
 )
-def test_a_step_is_what_its_report_and_its_exit_code_say(
-    step: Any, command: str, cases: list[str], counts: tuple[int, int, int], state: str
+def test_a_step_is_judged_by_its_report_and_its_exit_code(
+    step: Any,
+    command: str,
+    cases: list[str],
+    counts: tuple[int, int, int],
+    state: str,
 ) -> None:
     result = step(command, *cases, arguments=("-k", "crc") if command == "exit 5" else ())
     assert (result.passed, result.failed, len(result.skipped), result.state) == (*counts, state)
     assert (".crc: 3 is not 4" in result.failures) == ("failed" in cases)
 
 
-def test_a_step_without_tests_is_one_check_that_has_an_end(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_a_step_without_tests_is_one_check_with_a_time_limit(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     for command, limit_s, counts, note in (
         ("true", 60, (1, 0), ""),
@@ -61,27 +76,37 @@ def test_a_step_without_tests_is_one_check_that_has_an_end(
     ):
         monkeypatch.setitem(checks.STEPS, "lint", command)
         result = checks.run("lint", limit_s, tmp_path, (), False)
-        assert ((result.passed, result.failed), result.note) == (counts, note)
+        assert (result.passed, result.failed) == counts
+        assert result.note == note
 
 
-def test_what_is_missing_is_not_run_and_the_remedy_is_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_step_without_its_tools_is_not_run_and_the_remedy_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(checks.NEEDS, "faults", ("no-such-program", "sudo make one"))
     result = checks.run("faults", 60, tmp_path, (), False)
-    assert (result.state, result.note) == ("not run", "there is no no-such-program")
+    assert result.state == "not run"
+    assert result.note == "there is no no-such-program"
     assert checks.summarize([result], strict=False) == 0
     assert checks.summarize([result], strict=True) == 1
     assert "to enable it:  sudo make one" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("failed", "skipped", "code", "strict_code"), [(0, 0, 0, 0), (1, 0, 1, 1), (0, 2, 0, 1)]
+    ("failed", "skipped", "code", "strict_code"),
+    [(0, 0, 0, 0), (1, 0, 1, 1), (0, 2, 0, 1)],
 )
 def test_the_last_line_has_the_totals(
-    capsys: pytest.CaptureFixture[str], failed: int, skipped: int, code: int, strict_code: int
+    capsys: pytest.CaptureFixture[str],
+    failed: int,
+    skipped: int,
+    code: int,
+    strict_code: int,
 ) -> None:
-    reasons, failures = [("a.b", "no such tool")] * skipped, ["a.crc: 3 is not 4"] * failed
+    reasons = [("a.b", "no such tool")] * skipped
+    failures = ["a.crc: 3 is not 4"] * failed
     results = [
         checks.Result("unit", 1.0, 3, failed, reasons, failures),
         checks.Result("lint", 1.0, 1),
@@ -94,14 +119,14 @@ def test_the_last_line_has_the_totals(
     assert checks.summarize(results, strict=True) == strict_code
 
 
-def test_every_step_is_in_one_tier_and_a_test_of_each_marker_is_run_somewhere() -> None:
+def test_every_step_is_in_one_tier_and_every_marker_is_run() -> None:
     steps = [step for lanes in checks.TIERS.values() for lane in lanes for step in lane]
     assert sorted(steps) == sorted(checks.STEPS)
     for place in ("--ignore=tests/vcan", "-p no:cacheprovider tests/vcan"):
-        chosen = [
-            found[1]
-            for step in checks.STEPS.values()
-            if place in step and (found := re.search(" -m '?(not extended|extended)", step))
-        ]
+        chosen = []
+        for step in checks.STEPS.values():
+            found = re.search(" -m '?(not extended|extended)", step)
+            if place in step and found:
+                chosen.append(found[1])
         assert sorted(chosen) == ["extended", "not extended"]
     assert "-m 'extended or rights'" in checks.STEPS["tools"], "CI runs this one as root"

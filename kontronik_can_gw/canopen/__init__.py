@@ -1,1 +1,4 @@
-"""The CANopen node by CiA 301: one module per service, I/O-free, time passed in as integer nanoseconds."""
+"""The CANopen node (CiA 301): one module for each service.
+
+There is no I/O. Times are arguments, in whole nanoseconds.
+"""

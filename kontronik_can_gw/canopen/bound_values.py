@@ -1,6 +1,6 @@
-"""Objects that show a value of an ESC or of the gateway: how they are read by SDO and packed into PDOs.
+"""Reading of objects that show a value of an ESC or the gateway, by SDO and in PDOs.
 
-The one place of CANopen that compiles: packers of values are made once for all nodes.
+This is the only module of CANopen that compiles. Packers of values are shared by all nodes.
 """
 
 from collections.abc import Sequence
@@ -21,23 +21,27 @@ from kontronik_can_gw.signals.packer import compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
 from kontronik_can_gw.status import GatewayStatus
 
-_LAST_VALUE, _CODES = 1, 2  # 2100h:5; 0: abort
+_LAST_VALUE = 1
+"""2100h:5: SDO answers with the last value while telemetry is lost. With 0 it aborts."""
+_CODES = 2
+"""2100h:5: SDO answers with the number that means "not available" in a PDO."""
 _EVENT_OF_PACE = {
     Group.LIVE: Event.LIVE,
     Group.INFO: Event.INFO,
     Group.LINK: Event.SECOND | Event.LINK,
     Group.GATEWAY: Event.SECOND,
 }
-_MAX_PDOS = 256  # kept; masters can write any
+_MAX_PDOS = 256
+"""Maximum number of cached packers, because masters can write any number of mappings."""
 
 
 def bits_of(variable: Variable) -> int:
-    """Length of a variable in a PDO; 0 where it has no fixed one."""
+    """Return the number of bits of a variable in a PDO. 0 if its length is not fixed."""
     return TYPE_BITS.get(variable.entry.data_type, 0)
 
 
 def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatus) -> None:
-    """Let the objects that show a value of the ESC or of the gateway do so."""
+    """Bind all objects that show a value of the ESC or the gateway."""
     source = (esc, gateway)
     for (index, sub), bound in bindings_of(esc.protocol).items():
         variable = dictionary.get(index, sub)
@@ -53,41 +57,56 @@ def _read(
     source: tuple[EscTelemetry, GatewayStatus],
     now: int,
 ) -> Value:
-    """The value of an object by SDO. Without one it aborts, or shows what 2100h:5 says."""
-    esc, (low, high) = source[0], range_of(data_type)
+    """Return the value of an object for SDO.
+
+    If it is not available, 2100h:5 decides: SdoAbort, the last value, or the number that means
+    "not available".
+    """
+    esc, gateway = source
+    low, high = range_of(data_type)
     behaviour = dictionary.number(at.SETTINGS, 5)
-    value, why = None, Abort.NO_DATA
+    value = None
+    reason = Abort.NO_DATA
     if bound.source.group is not Group.LIVE or esc.live is not None:
-        value = bound.read(*source, now, high)
+        value = bound.read(esc, gateway, now, high)
     elif esc.last_live is not None:
         if behaviour == _LAST_VALUE:
             value = bound.last(esc, high)
         else:
-            why = Abort.DEVICE_STATE
+            reason = Abort.DEVICE_STATE
     if value is not None and low <= value <= high:
         return value
     if behaviour == _CODES:
         return high if low == 0 else low
-    raise SdoAbort(why)
+    raise SdoAbort(reason)
 
 
 def compile_pdo(mapped: Sequence[Variable]) -> SlotPlan:
-    """The packer of a PDO with these objects; one for all nodes where they show values only."""
+    """Return the plan of a PDO with these objects.
+
+    All nodes share it if the objects only show values.
+    """
     shown = tuple((each.entry, each.bound) for each in mapped if each.bound is not None)
-    return _shared_pdo(shown) if len(shown) == len(mapped) else _compile(mapped)
+    if len(shown) == len(mapped):
+        return _shared_pdo(shown)
+    return _compile(mapped)
 
 
 @lru_cache(_MAX_PDOS)
 def _shared_pdo(shown: tuple[tuple[Entry, Bound], ...]) -> SlotPlan:
     variables = []
     for entry, bound in shown:
-        variables.append(variable := Variable(entry))
+        variable = Variable(entry)
         variable.bound = bound
+        variables.append(variable)
     return _compile(variables)
 
 
 def _stored(variable: Variable) -> EscValue:
-    """An object that shows no value: storage, or of a service; not available where that has none (1003h)."""
+    """Return the source of an object that shows no value of an ESC or the gateway.
+
+    It stores its value or is bound to a service. A missing value (1003h) is not available.
+    """
 
     def read(_esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> Any:
         if variable.read is None:
@@ -101,7 +120,7 @@ def _stored(variable: Variable) -> EscValue:
 
 
 def message_plan(name: str, cob_id: int, mapped: Sequence[Variable]) -> MessagePlan:
-    """The plan of a PDO: one object after the other, the lowest bit first."""
+    """Return the plan of a PDO, which holds one object after the other, lowest bit first."""
     signals = []
     at_bit = 0
     for variable in mapped:
@@ -125,11 +144,25 @@ def message_plan(name: str, cob_id: int, mapped: Sequence[Variable]) -> MessageP
 
 
 def _signal_plan(variable: Variable, at_bit: int) -> SignalPlan:
-    entry, bound = variable.entry, variable.bound
+    entry = variable.entry
+    bound = variable.bound
     length = bits_of(variable)
     signed = entry.data_type in SIGNED
-    source = _stored(variable) if bound is None else bound.source
-    not_available = 1 << length - 1 if signed else (1 << length) - 1
+    if bound is None:
+        source = _stored(variable)
+        slope = Fraction(1)
+    else:
+        source = bound.source
+        slope = bound.slope
+    if signed:
+        sign_bit = 1 << length - 1
+        low = -sign_bit
+        high = sign_bit - 1
+        not_available = sign_bit
+    else:
+        low = 0
+        high = (1 << length) - 1
+        not_available = high
     return SignalPlan(
         name=entry.name,
         unit="",
@@ -138,11 +171,11 @@ def _signal_plan(variable: Variable, at_bit: int) -> SignalPlan:
         signed=signed,
         is_float=entry.data_type in FLOATS,
         pieces=(Piece(0, length, at_bit),),
-        low=-(1 << length - 1) if signed else 0,
-        high=(1 << length - signed) - 1,
+        low=low,
+        high=high,
         not_available=not_available,
         error=not_available,
-        slope=Fraction(1) if bound is None else bound.slope,
+        slope=slope,
         source=source,
         esc=None if source.group is Group.GATEWAY else 0,
     )
@@ -150,7 +183,8 @@ def _signal_plan(variable: Variable, at_bit: int) -> SignalPlan:
 
 def _compile(mapped: Sequence[Variable]) -> SlotPlan:
     plan = message_plan("TPDO", 0, mapped)
-    is_live = carries_link = False
+    is_live = False
+    carries_link = False
     status = []
     only_python = ""
     for variable, signal in zip(mapped, plan.signals, strict=True):
@@ -158,7 +192,7 @@ def _compile(mapped: Sequence[Variable]) -> SlotPlan:
         if bound is None:
             only_python = f"{variable.entry.index:04X}h is no value of an ESC"
             if variable.read is not None:
-                # of a service: the error register, the error code
+                # the error register and the error code, which are bound to a service
                 status.append(signal)
             continue
         is_live |= bound.source.group is Group.LIVE
@@ -170,12 +204,13 @@ def _compile(mapped: Sequence[Variable]) -> SlotPlan:
         triggers |= _EVENT_OF_PACE[pace]
     if status:
         triggers |= Event.LIVE | Event.LINK | Event.INFO
+    pack_watched = compile_pack(replace(plan, compiled=tuple(status))) if status else None
     return SlotPlan(
         message=plan,
         pack=compile_pack(plan),
         triggers=triggers,
         watched=sum(place(signal.pieces, -1) for signal in status),
-        pack_watched=compile_pack(replace(plan, compiled=tuple(status))) if status else None,
+        pack_watched=pack_watched,
         needs_live=is_live and not carries_link,
         only_python=only_python,
     )

@@ -1,4 +1,4 @@
-"""What an EDS must hold so that a node of ours can be built from it: found at start, each mistake by object."""
+"""Checks at the start that a node can be built from an EDS, and finds all mistakes by object."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
@@ -29,11 +29,11 @@ Mistake = tuple[Entry, str]
 _PDOS = range(COMMUNICATION, COMMUNICATION + MAX_TPDOS)
 _MAPPINGS = range(MAPPING, MAPPING + MAX_TPDOS)
 _PLAIN = frozenset({0x1000, 0x1008, 0x1009})
-"""Objects that no service knows."""
+"""Objects that no service uses."""
 _FREE = frozenset({0x1022, at.UNITS})
-"""Likewise, and of any type: copies of CiA's table differ."""
+"""Unused objects that may have any type, because copies of CiA's table differ."""
 _LISTS = {0x1003: 0xFE, 0x1016: 0x7F, 0x1029: 0xFE, MAPPING: 0x40}
-"""Lists that may be longer than those of the shipped EDS, and their last possible sub-index; all other services know theirs."""
+"""Lists that may be longer than in the shipped EDS, and their greatest possible sub-indices."""
 _SERVER = {(0x1200, 1): SDO_REQUEST, (0x1200, 2): SDO_ANSWER}
 _MANDATORY = {(0x1000, 0), (0x1001, 0), (0x1018, 1)}
 
@@ -41,16 +41,17 @@ _MANDATORY = {(0x1000, 0), (0x1001, 0), (0x1018, 1)}
 def check_eds(
     eds: Eds, shipped: Eds, escs: Sequence[EscSettings], node_ids: Iterable[int] = (1,)
 ) -> None:
-    """Whether nodes with these node-IDs, for these ESCs, can be built from an EDS. UserError with every mistake.
+    """Check that nodes with these node-IDs, for these ESCs, can be built from an EDS.
 
-    Objects that services know are as in the shipped EDS: of the same type and access below 2000h, from there on of the same kind.
+    Raises UserError with every mistake. Objects of services must be as in the shipped EDS. Below
+    2000h they must have the same type and access, otherwise a type of the same kind.
     """
     entries = {(entry.index, entry.sub): entry for entry in eds.entries}
-    found = (*_objects(entries, shipped), *_settings(entries, escs))
-    problems = [f"{entry.place} {entry.name}: {what}" for entry, what in found]
+    found = [*_objects(entries, shipped), *_settings(entries, escs)]
+    problems = [f"{entry.place} {entry.name}: {mistake}" for entry, mistake in found]
     problems += _missing(entries)
     if not problems:
-        numbers = list(node_ids) or [1]  # where all wait for LSS any node-ID may come
+        numbers = list(node_ids) or [1]  # if all nodes wait for LSS, any node-ID is possible
         for node_id in numbers:
             problems += _defaults(eds, escs[0], node_id)
         problems += _shared_ids(Dictionary(eds), numbers)
@@ -59,7 +60,10 @@ def check_eds(
 
 
 def _missing(entries: Mapping[Place, Entry]) -> Iterator[str]:
-    """Objects that are mandatory, by themselves or where their PDO is there, and each object's sub-index 0."""
+    """Yield the missing mandatory objects.
+
+    The second object of each PDO, and sub-index 0 of each object, are mandatory, too.
+    """
     needed = set(_MANDATORY)
     for index in {index for index, _ in entries}:
         if index in _PDOS:
@@ -72,30 +76,44 @@ def _missing(entries: Mapping[Place, Entry]) -> Iterator[str]:
 
 
 def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
-    """Types and access of what telemetry and services show and read."""
+    """Yield the mistakes in types and access of objects that telemetry and services use."""
     known = {(entry.index, entry.sub): entry for entry in shipped.entries}
     highest = dict(entries.keys())  # the last sub-index of each index
     for (index, sub), entry in entries.items():
-        like = COMMUNICATION if index in _PDOS else MAPPING if index in _MAPPINGS else index
-        reference = known.get((like, sub))
-        if reference is None and 0 < sub <= (0xFE if like >= 0x2000 else _LISTS.get(like, 0)):
-            reference = known.get((like, 1))
+        reference = _reference(known, index, sub)
         if reference is not None:
-            yield from ((entry, what) for what in _unlike(entry, reference))
+            for mistake in _unlike(entry, reference):
+                yield entry, mistake
         elif index < 0x2000:
             yield entry, "this node has no such service. Remove the object."
         first = _SERVER.get((index, sub))
         if first is not None and not (entry.default == first and entry.relative):
             yield entry, f"must be $NODEID+0x{first:X}: the SDO server has no other."
-        # of errors kept and of objects mapped it is a count that changes
-        counts = index == 0x1003 or index in _MAPPINGS
-        if not sub and entry.default != (last := highest[index]) and last and not counts:
+        # Sub-index 0 of these is a count that changes: of errors, or of mapped objects.
+        is_count = index == 0x1003 or index in _MAPPINGS
+        last = highest[index]
+        if sub == 0 and last and entry.default != last and not is_count:
             yield entry, f"must be 0x{last:02X}, the highest sub-index."
 
 
+def _reference(known: Mapping[Place, Entry], index: int, sub: int) -> Entry | None:
+    """Return the entry of the shipped EDS that an entry must resemble, or None."""
+    if index in _PDOS:
+        index = COMMUNICATION
+    elif index in _MAPPINGS:
+        index = MAPPING
+    reference = known.get((index, sub))
+    last = 0xFE if index >= 0x2000 else _LISTS.get(index, 0)
+    if reference is None and 0 < sub <= last:
+        reference = known.get((index, 1))
+    return reference
+
+
 def _unlike(entry: Entry, shipped: Entry) -> Iterator[str]:
-    """What makes an object useless for its service."""
-    index, kind, wanted = entry.index, entry.data_type, shipped.data_type
+    """Yield the properties that make an object useless for its service."""
+    index = entry.index
+    kind = entry.data_type
+    wanted = shipped.data_type
     if index in _FREE:
         return
     if (index < 0x2000 or wanted not in WHOLE) and kind != wanted:
@@ -132,28 +150,33 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
     dictionary = node.dictionary
     dictionary.reset(COMMUNICATION_PROFILE, node_id, {})
     for variable in dictionary.variables.values():
-        entry, check, value = variable.entry, variable.check, variable.value
+        entry = variable.entry
+        check = variable.check
+        value = variable.value
         if entry.index in CHECKED and check is not None and isinstance(value, int):
             try:
                 check(value)
             except SdoAbort as error:
                 of = f" (node-ID {node_id})" if entry.relative else ""
-                said = f"DefaultValue {value:#x}{of} is not allowed ({error})."
-                yield f"{entry.place} {entry.name}: {said}"
+                mistake = f"DefaultValue {value:#x}{of} is not allowed ({error})."
+                yield f"{entry.place} {entry.name}: {mistake}"
     for tpdo in node.tpdos:
         try:
             tpdo.read()
             tpdo.check()
         except SdoAbort as error:
-            index, mapping = tpdo.indices
+            index = tpdo.communication_index
+            mapping = tpdo.mapping_index
             yield (
-                f"TPDO {tpdo.number + 1}: the defaults of {index:04X}h and {mapping:04X}h do not make a PDO of node {node_id} ({error}). "
-                "Map objects with PDOMapping=1, in their own lengths, 64 bits in all, at a COB-ID that is free."
+                f"TPDO {tpdo.number + 1}: the defaults of {index:04X}h and {mapping:04X}h "
+                f"do not make a PDO of node {node_id} ({error}). "
+                "Map objects with PDOMapping=1, in their own lengths, 64 bits in all, "
+                "at a COB-ID that is free."
             )
 
 
 def _shared_ids(dictionary: Dictionary, node_ids: Sequence[int]) -> Iterator[str]:
-    """COB-IDs that two defaults have, of one node or of two; each pair of objects once."""
+    """Yield the COB-IDs that two defaults share, in one node or two. Each pair of objects once."""
     sync = dictionary.number(0x1005) & 0x7FF
     users = {sync: (0x1005, "1005h:00")}
     found = set()
@@ -163,4 +186,7 @@ def _shared_ids(dictionary: Dictionary, node_ids: Sequence[int]) -> Iterator[str
             other, whose = users.setdefault(cob_id, (index, who))
             if whose != who and (other, index) not in found:
                 found.add((other, index))
-                yield f"COB-ID {cob_id:03X}h is that of {whose} and of {who}. Change one DefaultValue (or add $NODEID)."
+                yield (
+                    f"COB-ID {cob_id:03X}h is that of {whose} and of {who}. "
+                    "Change one DefaultValue (or add $NODEID)."
+                )

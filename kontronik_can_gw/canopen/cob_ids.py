@@ -46,7 +46,8 @@ def default_ids(dictionary: Dictionary, node_id: int) -> Iterator[tuple[int, int
     if dictionary.get(0x1014) is None:
         yield 0x1014, 0, EMERGENCY + node_id
     for number, variable in dictionary.variables.items():
-        index, sub = number >> 8, number & 0xFF
+        index = number >> 8
+        sub = number & 0xFF
         if index == 0x1014 or (0x1800 <= index < 0x1A00 and sub == 1):
             cob_id = int(variable.default(node_id))
             if not cob_id & INVALID_BIT:

@@ -9,17 +9,21 @@ from kontronik_can_gw.esc.decoder import ErrorBit
 
 
 class Names:
-    """Names that are unique over the file, also where case is ignored, and no longer than tools take."""
+    """Makes names that are unique in the file, even if case is ignored, and not too long."""
 
     def __init__(self) -> None:
         self._taken: set[str] = set()
 
     def take(self, prefix: str, stem: str, end: str = "") -> str:
-        """``prefix`` + ``stem`` + ``end``. The stem is cut to fit, and gets a number where the name is taken."""
+        """Return a new name of ``prefix``, ``stem`` and ``end``.
+
+        The stem is shortened if necessary. A number is added to it if the name is already used.
+        """
         number = 1
         while True:
-            tail = f"{number if number > 1 else ''}{end}"
-            name = prefix + stem[: MAX_NAME - len(prefix) - len(tail)] + tail
+            tail = end if number == 1 else f"{number}{end}"
+            room = MAX_NAME - len(prefix) - len(tail)
+            name = prefix + stem[:room] + tail
             if name.lower() not in self._taken:
                 self._taken.add(name.lower())
                 return name
@@ -27,7 +31,10 @@ class Names:
 
 
 def pascal_case(text: str) -> str:
-    """A name in any spelling as DBC files have it: ``bec_voltage``, ``BEC voltage`` and ``BecVoltage`` become ``BecVoltage``."""
+    """Return a name in the spelling of DBC files.
+
+    For example, ``bec_voltage``, ``BEC voltage`` and ``BecVoltage`` become ``BecVoltage``.
+    """
     words = (
         re.sub("[A-Z]+(?=[A-Z][a-z]|[^a-z]*$)", _capitalized, word)
         for word in re.split("[^A-Za-z0-9]+", text)
@@ -36,14 +43,17 @@ def pascal_case(text: str) -> str:
 
 
 def emergency_names(bits: Sequence[ErrorBit]) -> dict[int, str]:
-    """Every emergency code a node can send, with its name; 0 is NoError."""
+    """Return the names of all emergency codes that a node can send. 0 is NoError."""
     named = {int(bit): pascal_case(bit.name) for bit in bits}
     codes = BitCodes(bits)
-    found = {0: "NoError"} | {codes.code(bit): named.get(bit, f"Bit{bit}") for bit in range(32)}
-    found |= {error.value[0]: pascal_case(error.name) for error in GatewayError}
-    found[GatewayError.TELEMETRY_LOST.value[0]] = (
-        "TelemetryFault"  # several findings share this code
-    )
+    found = {0: "NoError"}
+    for bit in range(32):
+        found[codes.code(bit)] = named.get(bit, f"Bit{bit}")
+    for error in GatewayError:
+        code, _ = error.value
+        found[code] = pascal_case(error.name)
+    shared_code, _ = GatewayError.TELEMETRY_LOST.value
+    found[shared_code] = "TelemetryFault"  # the name for all errors with this code
     return found
 
 

@@ -1,4 +1,4 @@
-"""EDS texts made from an EDS: without some objects, and as the DCF of one node (CiA 306, clause 5)."""
+"""Makes texts from an EDS: a shorter EDS, and the DCF of one node (CiA 306, clause 5)."""
 
 import re
 from collections.abc import Container, Mapping
@@ -25,18 +25,21 @@ _OF_OBJECT = re.compile(r"([0-9a-f]{4})(sub[0-9a-f]+|denotation|objectlinks)?$",
 
 
 def without(eds_data: bytes, indices: Container[int]) -> bytes:
-    """The EDS without these objects: their sections and list entries removed, lists renumbered."""
-    sections = {
-        name: section
-        for name, section in read_sections(eds_data, []).items()
-        if not (match := _OF_OBJECT.match(name)) or int(match[1], 16) not in indices
-    }
-    for section in (sections[name] for name in _LISTS if name in sections):
+    """Return the EDS without these objects. The remaining entries of its lists are renumbered."""
+    sections = {}
+    for name, section in read_sections(eds_data, []).items():
+        match = _OF_OBJECT.match(name)
+        if match is None or int(match[1], 16) not in indices:
+            sections[name] = section
+    for name in _LISTS:
+        if name not in sections:
+            continue
+        section = sections[name]
         listed = [value for key, (_, value) in section.keys.items() if key.isdigit()]
-        left = [value for value in listed if integer(value) not in indices]
+        kept = [value for value in listed if integer(value) not in indices]
         section.keys = {}
-        section.set("SupportedObjects", len(left))
-        for number, value in enumerate(left, 1):
+        section.set("SupportedObjects", len(kept))
+        for number, value in enumerate(kept, 1):
             section.set(str(number), value)
     return text_of(sections).encode("ascii", "replace")
 
@@ -49,11 +52,15 @@ def dcf(
     node_name: str,
     file_name: str,
 ) -> str:
-    """The EDS as the DCF of one node (CiA 306, clause 5): with a ParameterValue for each of ``values``, and [DeviceComissioning].
+    """Return the EDS as the DCF of one node (CiA 306, clause 5).
 
-    ``bitrate`` in bit/s. ``file_name`` is the DCF's; LastEDS names the EDS. Values are as they are in the node, with the node-ID worked in.
-    Domains are left out: a DCF names files for them. Real numbers are written as decimals, which the canopen package reads. Lines end in
-    CR LF. KeyError for a value that has no entry, UserError for a text that an INI file cannot hold.
+    It has a ParameterValue for each of ``values``, and the section [DeviceComissioning]. The node's
+    values already include the node-ID. ``bitrate`` is in bit/s. ``file_name`` is the name of the
+    DCF, and LastEDS has the name of the EDS. Lines end in CR LF.
+
+    Domains are left out, because a DCF has file names for them. Real numbers are written as
+    decimals, which the package canopen can read. Raises KeyError for a value without an entry, and
+    UserError for a text that an INI file cannot contain.
     """
     entries = {(entry.index, entry.sub): entry for entry in eds.entries}
     texts = {
@@ -64,21 +71,25 @@ def dcf(
     sections = read_sections(eds.data, [])
     for name, section in sections.items():
         section.keys.pop("parametervalue", None)
-        if match := OBJECT.match(name):
-            at = int(match[1], 16), int(match[2] or "0", 16)
+        match = OBJECT.match(name)
+        if match is not None:
+            at = (int(match[1], 16), int(match[2] or "0", 16))
             if at in texts:
                 section.set("ParameterValue", texts[at])
-    if (about := sections.get("fileinfo")) is not None:
-        about.set("FileName", file_name)
-        about.set("LastEDS", PurePath(eds.name).name.encode("ascii", "replace").decode("ascii"))
-    node = sections["devicecomissioning"] = Section("DeviceComissioning")  # CiA 306 spells it so
+    file_info = sections.get("fileinfo")
+    if file_info is not None:
+        eds_name = PurePath(eds.name).name
+        file_info.set("FileName", file_name)
+        file_info.set("LastEDS", eds_name.encode("ascii", "replace").decode("ascii"))
+    node = Section("DeviceComissioning")  # this is the spelling of CiA 306
+    sections["devicecomissioning"] = node
     node.set("NodeID", f"0x{node_id:02X}")
     node.set("NodeName", node_name)
     node.set("Baudrate", bitrate // 1000)
     node.set("NetNumber", 0)
     node.set("CANopenManager", 0)
-    # 0: not known, so nothing that an LSS master could look for
-    if isinstance(serial := values.get((0x1018, 4)), int) and serial:
+    serial = values.get((0x1018, 4))
+    if isinstance(serial, int) and serial != 0:  # 0: unknown, so an LSS master cannot search for it
         node.set("LSS_SerialNumber", f"0x{serial:08X}")
     return text_of(sections)
 
@@ -87,11 +98,15 @@ def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
     if isinstance(value, float):
         return repr(value)
     if isinstance(value, int):
-        return str(value) if value < 0 else f"0x{value:0{TYPE_BITS[entry.data_type] // 4 or 1}X}"
+        if value < 0:
+            return str(value)
+        digits = TYPE_BITS[entry.data_type] // 4 or 1
+        return f"0x{value:0{digits}X}"
     if entry.data_type == OCTET_STRING:
         return value.hex()
     text = value.decode("utf-16-le" if entry.data_type == UNICODE_STRING else "latin-1")
-    if not (text.isascii() and text.isprintable()) or bare(f"={text}")[1:].strip() != text:
-        what = f"the text {text!r} of {entry.name} cannot stand in a DCF."
-        raise UserError(f"{name}: {entry.place} {what}")
+    is_plain = text.isascii() and text.isprintable()
+    if not is_plain or bare(f"={text}")[1:].strip() != text:
+        problem = f"the text {text!r} of {entry.name} cannot stand in a DCF."
+        raise UserError(f"{name}: {entry.place} {problem}")
     return text

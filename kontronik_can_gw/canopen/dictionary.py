@@ -1,6 +1,7 @@
-"""The object dictionary of one node: values by index and sub-index, with every check that CiA 301 wants before one changes.
+"""The object dictionary of one node: values by index and sub-index, and the checks of CiA 301.
 
-Built from an EDS. A variable is either plain storage or bound: ``read`` then gives its value at each access.
+It is built from an EDS. A variable either stores its value or is bound to a service or an ESC. Then
+``read`` returns its value at each access.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -11,18 +12,18 @@ from kontronik_can_gw.canopen.objects import Bound
 
 Value = int | float | bytes
 Read = Callable[[int], Value]
-"""``now`` to value. Raises SdoAbort where there is none."""
+"""Returns a value at ``now``. SdoAbort if there is no value."""
 Check = Callable[[int], None]
-"""Raises SdoAbort for a value that is refused."""
+"""Raises SdoAbort for a value that must be refused."""
 Written = Callable[[int], bool | None]
-"""What follows a download, given ``now``. False: its confirmation comes later."""
+"""Acts on a download at ``now``. Returns False if it is confirmed later."""
 
 _MAX_TEXT = 255
 _MAX_DOMAIN = 0x10000
 
 
 def key(index: int, sub: int) -> int:
-    """Index and sub-index as one number, as PDO mappings have them in their upper 24 bits."""
+    """Return index and sub-index as one number, as in the upper 24 bits of a PDO mapping."""
     return index << 8 | sub
 
 
@@ -35,11 +36,11 @@ _IF_ABSENT = {
     key(0x1F80, 0): 4,
     key(0x2100, 6): 0x00FDFFFF,
 }
-"""Defaults of the shipped EDS that are not 0: what holds for an object that the EDS in use has dropped."""
+"""Values of objects that the EDS lacks, if not 0. They are the defaults of the shipped EDS."""
 
 
 class Abort(IntEnum):
-    """Why an SDO transfer is refused or ended: codes of CiA 301, 7.2.4.3.17, table 22."""
+    """Reasons for refusing or ending an SDO transfer (CiA 301, 7.2.4.3.17, table 22)."""
 
     TOGGLE = 0x05030000
     TIMEOUT = 0x05040000
@@ -69,7 +70,7 @@ class Abort(IntEnum):
 
 
 class SdoAbort(Exception):
-    """Raised by the dictionary, answered by the SDO server with an abort frame; never leaves the core."""
+    """The refusal of an access. The SDO server answers it with an abort frame."""
 
     def __init__(self, code: Abort) -> None:
         super().__init__(f"{code:08X}h {code.name}")
@@ -77,7 +78,7 @@ class SdoAbort(Exception):
 
 
 class Variable:
-    """One entry at work. ``check`` may refuse a new value; ``written`` follows one."""
+    """One entry with its value. ``check`` may refuse a new value, and ``written`` acts on it."""
 
     __slots__ = ("bound", "check", "codec", "entry", "power_on", "read", "value", "written")
 
@@ -85,7 +86,7 @@ class Variable:
         self.entry = entry
         self.codec = CODECS.get(entry.data_type)
         self.bound: Bound | None = None
-        """The value of ESC or gateway that it shows."""
+        """The value of the ESC or the gateway that the object shows."""
         self.read: Read | None = None
         self.check: Check | None = None
         self.written: Written | None = None
@@ -95,12 +96,12 @@ class Variable:
 
     @property
     def size(self) -> int | None:
-        """Bytes of the type; None for texts and domains."""
+        """Number of bytes of the type. None for texts and domains."""
         return None if self.codec is None else self.codec.size
 
     @property
     def max_size(self) -> int:
-        """The most bytes that can be written."""
+        """Maximum number of bytes that can be written."""
         if self.size is not None:
             return self.size
         return _MAX_DOMAIN if self.entry.data_type == DOMAIN_TYPE else _MAX_TEXT
@@ -114,14 +115,14 @@ class Variable:
         return "w" in self.entry.access
 
     def encode(self, value: Value) -> bytes:
-        """Little-endian bytes of a value."""
+        """Return the little-endian bytes of a value."""
         if self.codec is None:
             assert isinstance(value, bytes)
             return value
         return self.codec.pack(value)
 
     def decode(self, data: bytes) -> Value:
-        """The value of bytes of the right size."""
+        """Return the value of bytes, which must have the right size."""
         if self.codec is None:
             return data
         value: Value = self.codec.unpack(data)[0]
@@ -129,23 +130,24 @@ class Variable:
 
     def check_limits(self, value: Value) -> None:
         """SdoAbort 06090031h or 06090032h for a number outside the limits of the EDS."""
-        low, high = self.entry.low, self.entry.high
         if isinstance(value, bytes):
             return
+        low = self.entry.low
+        high = self.entry.high
         if high is not None and not value <= high:
             raise SdoAbort(Abort.TOO_HIGH)
         if low is not None and not value >= low:
             raise SdoAbort(Abort.TOO_LOW)
 
     def default(self, node_id: int) -> Value:
-        """The power-on value of a node with this node-ID: ``$NODEID`` worked in."""
+        """Return the power-on value of a node with this node-ID, which replaces ``$NODEID``."""
         if self.entry.relative and isinstance(self.power_on, int):
             return self.power_on + node_id
         return self.power_on
 
 
 def signature(word: bytes) -> Check:
-    """A check that refuses all numbers but that of these four letters: 08000020h."""
+    """Return a check that refuses any number except these four letters with 08000020h."""
 
     def check(value: int) -> None:
         if value != int.from_bytes(word, "little"):
@@ -155,18 +157,21 @@ def signature(word: bytes) -> Check:
 
 
 class Dictionary:
-    """All variables of one node. What is read or written over the bus goes through ``upload`` and ``download``."""
+    """All variables of one node.
+
+    Reads and writes over the bus use ``upload`` and ``download``.
+    """
 
     def __init__(self, eds: Eds) -> None:
         self.variables = {key(entry.index, entry.sub): Variable(entry) for entry in eds.entries}
         self._indices = frozenset(entry.index for entry in eds.entries)
         self.read_only = False
-        """True: nothing may be written over the bus."""
+        """True if all writes over the bus are refused."""
         self.written: Callable[[Variable, bool, int], None] = lambda _variable, _changed, _now: None
-        """Called after each download; the flag says whether the value is another one."""
+        """Called after each download with the variable, True if its value changed, and the time."""
 
     def get(self, index: int, sub: int = 0) -> Variable | None:
-        """The variable, None where there is none."""
+        """Return the variable, or None if there is none."""
         return self.variables.get(key(index, sub))
 
     def bind(
@@ -178,51 +183,60 @@ class Dictionary:
         check: Check | None = None,
         written: Written | None = None,
     ) -> None:
-        """Give an object to its service: what it shows, which values it refuses, what follows a download.
+        """Bind an object to a service.
 
-        Does nothing where the EDS has no such object.
+        ``read`` returns its value, ``check`` may refuse a new value, and ``written`` acts on a
+        download. Nothing happens if the EDS lacks the object.
         """
         variable = self.get(index, sub)
         if variable is not None:
-            variable.read, variable.check, variable.written = read, check, written
+            variable.read = read
+            variable.check = check
+            variable.written = written
 
     def number(self, index: int, sub: int = 0, otherwise: int | None = None) -> int:
-        """The whole number that a variable holds. Where the EDS has no such variable ``otherwise``, None: the shipped EDS's default."""
+        """Return the whole number that a variable stores.
+
+        Without such a variable it is ``otherwise``, or the shipped EDS's default if that is None.
+        """
         variable = self.get(index, sub)
         if variable is not None and isinstance(variable.value, int):
             return variable.value
-        return _IF_ABSENT.get(key(index, sub), 0) if otherwise is None else otherwise
+        if otherwise is not None:
+            return otherwise
+        return _IF_ABSENT.get(key(index, sub), 0)
 
     def subs(self, index: int) -> Iterator[Variable]:
-        """Variables of an array or record, from sub-index 1 on."""
+        """Yield the variables of an array or record, beginning at sub-index 1."""
         for sub in range(1, 255):
-            if (variable := self.get(index, sub)) is not None:
+            variable = self.get(index, sub)
+            if variable is not None:
                 yield variable
 
     def find(self, index: int, sub: int) -> Variable:
-        """The variable. SdoAbort 06020000h or 06090011h where there is none."""
+        """Return the variable. SdoAbort 06020000h or 06090011h if there is none."""
         variable = self.variables.get(key(index, sub))
         if variable is None:
             raise SdoAbort(Abort.NO_SUB_INDEX if index in self._indices else Abort.NO_OBJECT)
         return variable
 
     def value(self, variable: Variable, now: int) -> Value:
-        """What a variable holds now. SdoAbort where its source has nothing."""
+        """Return the present value of a variable. SdoAbort if its source has none."""
         return variable.value if variable.read is None else variable.read(now)
 
-    # --- what the SDO server asks
+    # --- access of the SDO server
 
     def upload(self, index: int, sub: int, now: int) -> bytes:
-        """The bytes that are read over the bus."""
+        """Return the bytes of a variable. SdoAbort if it is absent, write only or has no value."""
         variable = self.find(index, sub)
         if not variable.readable:
             raise SdoAbort(Abort.WRITE_ONLY)
         return variable.encode(self.value(variable, now))
 
     def check_download(self, index: int, sub: int, size: int | None) -> int:
-        """Whether ``size`` bytes may be written there, before any is moved (CiA 301, 7.2.4.3.17: the abort code says why not).
+        """Check that ``size`` bytes (None: an unknown number) may be written, before the transfer.
 
-        Returns how many may be written at most.
+        SdoAbort with the reason if not (CiA 301, 7.2.4.3.17). Returns the maximum number of bytes.
         """
         variable = self.find(index, sub)
         if self.read_only:
@@ -236,7 +250,7 @@ class Dictionary:
         return variable.max_size
 
     def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
-        """Write. False where the confirmation comes later."""
+        """Write a value. Returns False if it is confirmed later. SdoAbort if it is refused."""
         self.check_download(index, sub, len(data))
         variable = self.find(index, sub)
         value = variable.decode(data)
@@ -246,25 +260,27 @@ class Dictionary:
             variable.check(value)
         changed = self.value(variable, now) != value
         variable.value = value
-        later = variable.written is not None and variable.written(now) is False
+        is_confirmed_later = variable.written is not None and variable.written(now) is False
         self.written(variable, changed, now)
-        return not later
+        return not is_confirmed_later
 
     # --- power-on and storage
 
     def reset(self, profile: range, node_id: int, stored: Mapping[int, bytes]) -> list[int]:
-        """Give the variables of these indices their power-on values: the stored one where there is one, else the default.
+        """Set the variables of these indices to their stored values, or else to their defaults.
 
-        Returns the keys of stored values that are rejected: they do not fit this EDS (any more).
+        Returns the keys of stored values that were rejected because they do not fit this EDS.
         """
         rejected = [number for number in stored if number not in self.variables]
         for number, variable in self.variables.items():
             if number >> 8 not in profile:
                 continue
             variable.value = variable.default(node_id)
-            if (data := stored.get(number)) is None:
+            data = stored.get(number)
+            if data is None:
                 continue
-            if not variable.writable or (variable.size is not None and len(data) != variable.size):
+            has_wrong_size = variable.size is not None and len(data) != variable.size
+            if not variable.writable or has_wrong_size:
                 rejected.append(number)
                 continue
             value = variable.decode(data)
@@ -277,12 +293,14 @@ class Dictionary:
         return rejected
 
     def to_store(self, profile: range, node_id: int) -> dict[int, bytes]:
-        """What differs from the defaults: all that a parameter store needs to keep, so that $NODEID stays alive in the rest."""
-        return {
-            number: variable.encode(variable.value)
-            for number, variable in self.variables.items()
-            if number >> 8 in profile
-            and "rw" in variable.entry.access
-            and variable.read is None
-            and variable.value != variable.default(node_id)
-        }
+        """Return the raw bytes of the variables that differ from their defaults.
+
+        The others need not be stored, and so continue to follow ``$NODEID``.
+        """
+        changed = {}
+        for number, variable in self.variables.items():
+            if number >> 8 not in profile or variable.read is not None:
+                continue
+            if "rw" in variable.entry.access and variable.value != variable.default(node_id):
+                changed[number] = variable.encode(variable.value)
+        return changed

@@ -1,15 +1,22 @@
-"""Electronic data sheets of CiA 306: what a node is built from. Text in, entries out.
+"""Reader of electronic data sheets (CiA 306), from which nodes are built.
 
-Refused is what cannot be read, or only in several ways: limits, types, defaults that do not fit, what stands there twice; by file, section,
-key and remedy, one mistake of each section at once. What concerns other readers of the file only (lists of objects, counts, ObjectType,
-[DeviceInfo]) is not looked at. ``check`` judges whether a node can be built from the entries.
+A text is refused if it cannot be read, or only in several ways: limits, types and defaults that do
+not fit, and duplicates. Mistakes name the file, section, key and remedy, with one mistake of each
+section at once. Ignored is everything that only other readers need (lists of objects, counts,
+ObjectType, [DeviceInfo]). ``check`` decides whether a node can be built from the entries.
 
-Files of usual Windows editors are read too: with a byte order mark, with letters beyond ASCII in names and comments, with CR as line end,
-with a trailing Ctrl-Z. Such letters are replaced by ASCII ones; 1021h has the file as it is.
+Files of usual Windows editors are accepted: with a byte order mark, with letters beyond ASCII in
+names and comments, with CR as line end, and with a trailing Ctrl-Z. Such letters are replaced by
+ASCII ones. 1021h returns the file unchanged.
 
-Choices where CiA 306 leaves room: section and key names in any case; LF and CR as well as CR LF; a key without a value is a key that is not
-there; an object has sub-indices where it has sections of them, else it is a variable; section names that it does not know are ignored.
-Types of 24, 40, 48 and 56 bits and times are refused.
+CiA 306 leaves room for these choices:
+
+* Section and key names may be in any case.
+* Lines may end in LF, CR or CR LF.
+* A key without a value counts as absent.
+* An object has sub-indices if it has sections for them, else it is a variable.
+* Section names that CiA 306 does not define are ignored.
+* Types of 24, 40, 48 and 56 bits, and times, are refused.
 """
 
 import re
@@ -20,12 +27,18 @@ from dataclasses import dataclass, field
 from kontronik_can_gw.canopen.eds_text import decode_text, to_ascii
 from kontronik_can_gw.errors import UserError
 
-# --- data types of CiA 301 (table 44) that the object dictionary can have
+# --- data types of CiA 301 (table 44) that are supported
 
 BOOLEAN = 0x01
-U8, U16, U32 = 0x05, 0x06, 0x07
-VISIBLE_STRING, OCTET_STRING, UNICODE_STRING, DOMAIN_TYPE = 0x09, 0x0A, 0x0B, 0x0F
-REAL32, REAL64 = 0x08, 0x11
+U8 = 0x05
+U16 = 0x06
+U32 = 0x07
+REAL32 = 0x08
+VISIBLE_STRING = 0x09
+OCTET_STRING = 0x0A
+UNICODE_STRING = 0x0B
+DOMAIN_TYPE = 0x0F
+REAL64 = 0x11
 _TYPES = {
     BOOLEAN: ("BOOLEAN", "?"),
     0x02: ("INTEGER8", "b"),
@@ -43,40 +56,43 @@ _TYPES = {
     0x15: ("INTEGER64", "q"),
     0x1B: ("UNSIGNED64", "Q"),
 }
-"""Name, and of a number its struct code."""
+"""Name and struct code of each type. The code is empty for texts and domains."""
 TYPE_NAMES = {code: name for code, (name, _) in _TYPES.items()}
 SIGNED = frozenset(code for code, (_, form) in _TYPES.items() if form and form in "bhiq")
 FLOATS = frozenset({REAL32, REAL64})
 CODECS = {code: struct.Struct(f"<{form}") for code, (_, form) in _TYPES.items() if form}
-"""Of the number types, by their codes."""
-TYPE_BITS = {code: 8 * found.size for code, found in CODECS.items()} | {BOOLEAN: 1}
-"""Bits of a number type."""
+"""Codecs of the number types."""
+TYPE_BITS = {code: 8 * codec.size for code, codec in CODECS.items()} | {BOOLEAN: 1}
+"""Numbers of bits of the number types."""
 WHOLE = TYPE_BITS.keys() - FLOATS - {BOOLEAN}
 """The types of whole numbers."""
 
 
 def range_of(data_type: int) -> tuple[int, int]:
-    """Smallest and greatest value of a type of whole numbers, or BOOLEAN."""
+    """Return the lowest and highest value of a whole-number type or BOOLEAN."""
     bits = TYPE_BITS.get(data_type, 0)
     if data_type in SIGNED:
         return -(1 << bits - 1), (1 << bits - 1) - 1
     return 0, (1 << bits) - 1
 
 
-# --- the text: sections, keys, values, there and back (CiA 306, clause 4)
+# --- reading and writing of sections, keys and values (CiA 306, clause 4)
 
 _HEADING = re.compile(r"\s*\[([^\]]*)\]")
 _COMMENT = re.compile(r"(?:^|\s);.*|^\s*#.*")
 OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
-"""The section of an object or of one of its sub-indices."""
+"""Name of the section of an object or of one of its sub-indices."""
 _EXACT_KEYS = frozenset({"defaultvalue", "parametervalue"})
-"""Keys whose values nodes send: no letter of them may be replaced."""
+"""Keys whose values nodes send, so that no letter may be replaced."""
 _NUMBER = re.compile(r"-?(?:0x[0-9a-f]{1,20}|0|[1-9][0-9]{0,20})$", re.IGNORECASE)
 
 
 @dataclass
 class Section:
-    """One section: its name as written, and by keys in lower case each key as written and its value."""
+    """One section with its name as written.
+
+    ``keys`` maps each key in lower case to the key as written and its value.
+    """
 
     name: str
     keys: dict[str, tuple[str, str]] = field(default_factory=dict)
@@ -85,86 +101,105 @@ class Section:
         return self.keys.get(key.lower(), ("", ""))[1]
 
     def set(self, key: str, value: object) -> None:
-        self.keys[key.lower()] = key, str(value)
+        self.keys[key.lower()] = (key, str(value))
 
-    def said(self, key: str) -> str:
-        """A key as a mistake quotes it."""
+    def quoted(self, key: str) -> str:
+        """Return a key with its value, to be quoted in a mistake."""
         return f"{key}={self.get(key)}"
 
     def number(self, key: str, otherwise: int = 0) -> int:
-        """The number of a key; ``otherwise`` where it has no value. ValueError for what is no number."""
+        """Return the number of a key, or ``otherwise`` without a value.
+
+        ValueError if the value is not a number.
+        """
         text = self.get(key)
-        found = integer(text) if text else otherwise
-        if found is None:
-            raise ValueError(f"{self.said(key)}: not a number. Write 0x1F or 31.")
-        return found
+        if not text:
+            return otherwise
+        number = integer(text)
+        if number is None:
+            raise ValueError(f"{self.quoted(key)}: not a number. Write 0x1F or 31.")
+        return number
 
 
 def read_sections(data: bytes, problems: list[str]) -> dict[str, Section]:
-    """The sections by their names in lower case, those of objects in one spelling. What is wrong is added to ``problems``."""
-    found: dict[str, Section] = {}
-    section, where = Section(""), ""
+    """Return the sections by name in lower case, with one spelling for each object.
+
+    Mistakes are added to ``problems``.
+    """
+    sections: dict[str, Section] = {}
+    section = Section("")
+    where = ""
     for line in decode_text(data).split("\n"):
-        if heading := _HEADING.match(line):
+        heading = _HEADING.match(line)
+        if heading:
             section = Section(to_ascii(heading[1].strip()))
             where = f"[{section.name}] "
-            if found.setdefault(_spelling(section.name), section) is not section:
+            if sections.setdefault(_spelling(section.name), section) is not section:
                 problems.append(f"{where}this section is there twice. Remove one.")
-        elif text := bare(line):
-            key, equals, value = (part.strip() for part in text.partition("="))
-            if not value.isascii():
-                if key.lower() in _EXACT_KEYS:
-                    what = f"{_quoted(text)} has letters beyond ASCII. Write it in plain letters."
-                    problems.append(where + what)
-                value = to_ascii(value)
-            if not (equals and key and where):
-                what = f"'{_quoted(text)}' is neither a section, nor key=value, nor a comment after ';'."
-                problems.append(where + what)
-            elif key.lower() in section.keys:
-                problems.append(f"{where}{_quoted(key)}: this key is there twice. Remove one.")
-            else:
-                section.set(key, value)
-    return found
+            continue
+        text = bare(line)
+        if text:
+            problems += [where + problem for problem in _read_key(section, text, bool(where))]
+    return sections
+
+
+def _read_key(section: Section, text: str, has_heading: bool) -> Iterator[str]:
+    """Add a line ``key=value`` to its section, and yield its mistakes."""
+    key, equals, value = (part.strip() for part in text.partition("="))
+    if not value.isascii():
+        if key.lower() in _EXACT_KEYS:
+            yield f"{_quoted(text)} has letters beyond ASCII. Write it in plain letters."
+        value = to_ascii(value)
+    if not (equals and key and has_heading):
+        yield f"'{_quoted(text)}' is neither a section, nor key=value, nor a comment after ';'."
+    elif key.lower() in section.keys:
+        yield f"{_quoted(key)}: this key is there twice. Remove one."
+    else:
+        section.set(key, value)
 
 
 def _quoted(text: str) -> str:
-    """A text of the file as a mistake quotes it."""
+    """Return a text of the file in ASCII, to be quoted in a mistake."""
     return text.encode("ascii", "backslashreplace").decode("ascii")
 
 
 def text_of(sections: Mapping[str, Section]) -> str:
-    """The text of sections, without comments; lines end in CR LF."""
+    """Return the text of sections, without comments. Lines end in CR LF."""
     lines: list[str] = []
     for section in sections.values():
-        lines += [f"[{section.name}]", *(f"{key}={value}" for key, value in section.keys.values())]
+        lines.append(f"[{section.name}]")
+        lines += [f"{key}={value}" for key, value in section.keys.values()]
         lines.append("")
     return "\r\n".join(lines)
 
 
 def bare(line: str) -> str:
-    """A line without comment and surrounding blanks."""
+    """Return a line without its comment and surrounding blanks."""
     return _COMMENT.sub("", line).strip()
 
 
 def integer(text: str) -> int | None:
-    """A decimal or hexadecimal number; None for any other text."""
+    """Return a decimal or hexadecimal number. None for any other text."""
     return int(text, 0) if _NUMBER.match(text) else None
 
 
 def _spelling(name: str) -> str:
-    """``1018SUB01`` is ``1018sub1``."""
+    """Return the one spelling of a section name: ``1018sub1`` for ``1018SUB01``."""
     match = OBJECT.match(name)
-    return f"{match[1]}sub{int(match[2], 16):x}".lower() if match and match[2] else name.lower()
+    if match is None or match[2] is None:
+        return name.lower()
+    return f"{match[1]}sub{int(match[2], 16):x}".lower()
 
 
 # --- entries
 
 MAX_BYTES = 2_000_000
-"""Of an EDS; the shipped one has 60 kB, 250 entries, 2 200 lines."""
+"""Maximum size of an EDS. The shipped one has 60 kB, 250 entries and 2 200 lines."""
 _MAX_PROBLEMS = 20
-_MAX_SAID = 500
-"""Characters of a mistake: it quotes the file."""
+_MAX_LENGTH = 500
+"""Maximum number of characters of a mistake, which quotes the file."""
 _DOMAIN_OBJECT = 2
+"""ObjectType of a domain."""
 _ACCESS = ("ro", "wo", "rw", "rwr", "rww", "const")
 _NODE_ID = re.compile(
     r"\$NODEID(?:\+(?P<after>[^+]+))?$|(?P<before>[^+]+)\+\$NODEID$", re.IGNORECASE
@@ -175,8 +210,8 @@ _NODE_ID = re.compile(
 class Entry:
     """One entry of the object dictionary, as the EDS describes it.
 
-    ``access`` is ro, wo, rw, rwr, rww or const. ``default`` is an int, a float, or bytes for texts and domains; with ``relative`` the
-    node-ID is still to be added to it.
+    ``access`` is ro, wo, rw, rwr, rww or const. ``default`` is an int, a float, or bytes for texts
+    and domains. If ``relative``, the node-ID must be added to it.
     """
 
     index: int
@@ -197,7 +232,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Eds:
-    """What was read of an EDS. ``data`` are the bytes as given, ``entries`` are in the order of index and sub-index."""
+    """A parsed EDS. ``data`` is the unchanged file. ``entries`` are ordered by index and sub-index."""
 
     data: bytes
     name: str
@@ -206,89 +241,130 @@ class Eds:
 
 
 def load(data: bytes, name: str) -> Eds:
-    """Read an EDS by CiA 306. UserError with the mistakes: file, section, key, what is wrong and what to do."""
+    """Return a parsed EDS.
+
+    UserError with the mistakes: file, section, key, reason and remedy.
+    """
     known = ("[fileinfo]", "[deviceinfo]", "[mandatoryobjects]")
     text = decode_text(data[: MAX_BYTES + 1]).lower()
     if not any(section in text for section in known):
         raise UserError(
-            f"{name}: is no EDS: it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects]."
+            f"{name}: is no EDS: "
+            "it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects]."
         )
     if len(data) > MAX_BYTES:
         raise UserError(f"{name}: is larger than {MAX_BYTES // 1_000_000} MB. Is it an EDS?")
     problems: list[str] = []
     sections = read_sections(data, problems)
-    entries, names = [], {}
+    entries: list[Entry] = []
+    object_names: dict[int, str] = {}
     for index, sub, section in _entry_sections(sections, problems):
         try:
             entries.append(_entry(section, index, sub))
         except ValueError as error:
             problems.append(f"[{section.name}] {error}")
-        names[index] = sections[f"{index:04x}"].get("ParameterName")
+        object_names[index] = sections[f"{index:04x}"].get("ParameterName")
     if problems:
+        lines = [f"{name}: {_cut(problem)}" for problem in problems[:_MAX_PROBLEMS]]
         more = len(problems) - _MAX_PROBLEMS
-        rest = [f"{name}: and {more} more mistakes."] if more > 0 else []
-        raise UserError(*(f"{name}: {_cut(text)}" for text in problems[:_MAX_PROBLEMS]), *rest)
-    return Eds(data, name, tuple(entries), names)
+        if more > 0:
+            lines.append(f"{name}: and {more} more mistakes.")
+        raise UserError(*lines)
+    return Eds(data, name, tuple(entries), object_names)
 
 
 def _cut(text: str) -> str:
-    """A mistake without its middle, if it is long: what is wrong and the remedy stand at its ends."""
-    half = _MAX_SAID // 2
-    return text if len(text) <= _MAX_SAID else f"{text[:half]} ... {text[-half:]}"
+    """Return a mistake without its middle if it is long. Its ends hold the reason and the remedy."""
+    if len(text) <= _MAX_LENGTH:
+        return text
+    half = _MAX_LENGTH // 2
+    return f"{text[:half]} ... {text[-half:]}"
 
 
 def _entry_sections(
     sections: Mapping[str, Section], problems: list[str]
 ) -> Iterator[tuple[int, int, Section]]:
-    """Index, sub-index and section of each entry."""
+    """Yield index, sub-index and section of each entry, and add mistakes to ``problems``."""
     if "devicecomissioning" in sections:
-        what = "this is a DCF, the file of one node. Give the EDS it was made from."
-        problems.append(f"[DeviceComissioning] {what}")
-    if integer(sections.get("deviceinfo", Section("")).get("CompactPDO") or "0") != 0:
-        what = "not supported. Describe each PDO by its own sections and write 0."
-        problems.append(f"[DeviceInfo] CompactPDO: {what}")
-    members: dict[int, dict[int, Section]] = {}
-    for section in sections.values():
-        if match := OBJECT.match(section.name):
-            of_object = members.setdefault(int(match[1], 16), {})
-            if match[2] is not None:
-                of_object[int(match[2], 16)] = section
-    for index, subs in sorted(members.items()):
+        problem = "this is a DCF, the file of one node. Give the EDS it was made from."
+        problems.append(f"[DeviceComissioning] {problem}")
+    device_info = sections.get("deviceinfo", Section(""))
+    if _is_set(device_info, "CompactPDO"):
+        problem = "not supported. Describe each PDO by its own sections and write 0."
+        problems.append(f"[DeviceInfo] CompactPDO: {problem}")
+    for index, subs in sorted(_objects(sections).items()):
         head = sections.get(f"{index:04x}")
         if head is None:
-            what = f"there is no section [{index:04X}]. Add it or remove this one."
-            problems += [f"[{section.name}] {what}" for section in subs.values()]
-        elif integer(head.get("CompactSubObj") or "0") != 0:
-            what = "CompactSubObj: not supported. Let the EDS editor expand it, a section for each sub-index."
-            problems.append(f"[{head.name}] {what}")
+            problem = f"there is no section [{index:04X}]. Add it or remove this one."
+            problems += [f"[{section.name}] {problem}" for section in subs.values()]
+        elif _is_set(head, "CompactSubObj"):
+            problem = (
+                "CompactSubObj: not supported. "
+                "Let the EDS editor expand it, a section for each sub-index."
+            )
+            problems.append(f"[{head.name}] {problem}")
         else:
-            for sub, section in sorted((subs or {0: head}).items()):
+            members = subs or {0: head}
+            for sub, section in sorted(members.items()):
                 yield index, sub, section
 
 
+def _is_set(section: Section, key: str) -> bool:
+    """Return True unless the key is absent or 0."""
+    return integer(section.get(key) or "0") != 0
+
+
+def _objects(sections: Mapping[str, Section]) -> dict[int, dict[int, Section]]:
+    """Return the sections of sub-indices of each object by index and sub-index."""
+    objects: dict[int, dict[int, Section]] = {}
+    for section in sections.values():
+        match = OBJECT.match(section.name)
+        if match is None:
+            continue
+        subs = objects.setdefault(int(match[1], 16), {})
+        if match[2] is not None:
+            subs[int(match[2], 16)] = section
+    return objects
+
+
 def _entry(section: Section, index: int, sub: int) -> Entry:
-    """ValueError for what is wrong."""
+    """Return the entry of a section. ValueError for a mistake."""
     is_domain = section.number("ObjectType") == _DOMAIN_OBJECT
     data_type = section.number("DataType", DOMAIN_TYPE if is_domain else 0)
     if data_type not in TYPE_NAMES:
         known = ", ".join(f"0x{code:X} {name}" for code, name in TYPE_NAMES.items())
-        raise ValueError(f"{section.said('DataType')}: not supported. Take one of {known}.")
+        raise ValueError(f"{section.quoted('DataType')}: not supported. Take one of {known}.")
     access = section.get("AccessType").lower() or ("rw" if is_domain else "")
     if access not in _ACCESS:
-        raise ValueError(f"{section.said('AccessType')}: not one of {', '.join(_ACCESS)}.")
-    low, high = _limit(section, "LowLimit", data_type), _limit(section, "HighLimit", data_type)
+        raise ValueError(f"{section.quoted('AccessType')}: not one of {', '.join(_ACCESS)}.")
+    low = _limit(section, "LowLimit", data_type)
+    high = _limit(section, "HighLimit", data_type)
     default, relative = _default(section, data_type)
     if isinstance(default, int) and not relative:
         if low is not None and default < low:
-            raise ValueError(f"{section.said('DefaultValue')}: below {section.said('LowLimit')}.")
+            raise ValueError(
+                f"{section.quoted('DefaultValue')}: below {section.quoted('LowLimit')}."
+            )
         if high is not None and default > high:
-            raise ValueError(f"{section.said('DefaultValue')}: above {section.said('HighLimit')}.")
-    mappable = bool(section.number("PDOMapping"))
-    about = section.get("ParameterName"), data_type, access, mappable
-    return Entry(index, sub, *about, low, high, default, relative)
+            raise ValueError(
+                f"{section.quoted('DefaultValue')}: above {section.quoted('HighLimit')}."
+            )
+    return Entry(
+        index=index,
+        sub=sub,
+        name=section.get("ParameterName"),
+        data_type=data_type,
+        access=access,
+        mappable=bool(section.number("PDOMapping")),
+        low=low,
+        high=high,
+        default=default,
+        relative=relative,
+    )
 
 
 def _limit(section: Section, key: str, data_type: int) -> int | None:
+    """Return a limit, or None without a value. ValueError for a mistake."""
     text = section.get(key)
     if not text:
         return None
@@ -298,21 +374,25 @@ def _limit(section: Section, key: str, data_type: int) -> int | None:
 
 
 def _fitting(section: Section, key: str, text: str, data_type: int, room: int = 0) -> int:
-    """A whole number that fits its type with ``room`` above it. Signed ones may be hexadecimal in two's complement."""
+    """Return a whole number that fits its type with ``room`` above it.
+
+    Signed numbers may be hexadecimal in two's complement. ValueError for a mistake.
+    """
     number = integer(text)
     if number is None:
-        raise ValueError(f"{section.said(key)}: not a number. Write 0x1F or 31.")
+        raise ValueError(f"{section.quoted(key)}: not a number. Write 0x1F or 31.")
     low, high = range_of(data_type)
-    if data_type in SIGNED and "x" in text.lower() and high < number <= high - low:
+    is_hexadecimal = "x" in text.lower()
+    if data_type in SIGNED and is_hexadecimal and high < number <= high - low:
         number -= high - low + 1
     if not low <= number <= high - room:
         of_type = f"{TYPE_NAMES[data_type]}, {low} to {high}"
-        raise ValueError(f"{section.said(key)}: does not fit {of_type}.")
+        raise ValueError(f"{section.quoted(key)}: does not fit {of_type}.")
     return number
 
 
 def _default(section: Section, data_type: int) -> tuple[int | float | bytes | None, bool]:
-    """The default, and whether the node-ID is to be added to it."""
+    """Return the default, and True if the node-ID must be added to it."""
     text = section.get("DefaultValue")
     if not text:
         return None, False
@@ -323,23 +403,25 @@ def _default(section: Section, data_type: int) -> tuple[int | float | bytes | No
         try:
             return bytes.fromhex(text), False
         except ValueError:
-            what = "not bytes. Write pairs of hexadecimal digits, or nothing."
-            raise ValueError(f"DefaultValue={text}: {what}") from None
+            problem = "not bytes. Write pairs of hexadecimal digits, or nothing."
+            raise ValueError(f"DefaultValue={text}: {problem}") from None
     if data_type in FLOATS:
         return _real(text, data_type), False
-    if match := _NODE_ID.match(text.replace(" ", "")):
+    match = _NODE_ID.match(text.replace(" ", ""))
+    if match:
         value = match["after"] or match["before"] or "0"
         return _fitting(section, "DefaultValue", value, data_type, room=127), True
     return _fitting(section, "DefaultValue", text, data_type), False
 
 
 def _real(text: str, data_type: int) -> float:
-    """A decimal, or the hexadecimal bits of the IEEE number that CiA 306 writes."""
+    """Return a real number, written as a decimal or as the hexadecimal bits of CiA 306."""
     codec = CODECS[data_type]
     try:
         if "x" not in text.lower():
             return float(text)
-        number: float = codec.unpack(int(text, 16).to_bytes(codec.size, "little"))[0]
+        bits = int(text, 16)
+        number: float = codec.unpack(bits.to_bytes(codec.size, "little"))[0]
         return number
     except (ValueError, OverflowError):
         raise ValueError(f"DefaultValue={text}: not a number. Write 1.5.") from None

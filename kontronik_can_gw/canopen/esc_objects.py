@@ -78,6 +78,7 @@ class EscObjects:
         emergencies = self._emergencies
         link = esc.link
         if events & Event.LINK:
+            # The port's error begins before other errors end, so that no 0000h is sent in between.
             if link is LinkState.PORT_ERROR:
                 emergencies.set(GatewayError.PORT_GONE, True, now)
             expired_ns = esc.live_bound_ns + esc.settings.timeout_ns
@@ -105,11 +106,13 @@ class EscObjects:
         return at.link_status(esc, gateway, now) | int(gateway.can_state) << 8 | fresh << 16
 
     def _device_name(self, _now: int) -> bytes:
-        protocol, info = self._esc.protocol, self._esc.last_info
+        protocol = self._esc.protocol
+        info = self._esc.last_info
         device = protocol.value("device_raw", info)
         if device is None:
             raise SdoAbort(Abort.NO_DATA)
-        return (protocol.device_name(info) or f"device {device}").encode("ascii", "replace")
+        name = protocol.device_name(info) or f"device {device}"
+        return name.encode("ascii", "replace")
 
     def _firmware(self, _now: int) -> bytes:
         text = self._esc.protocol.firmware_text(self._esc.last_info)

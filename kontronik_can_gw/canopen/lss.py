@@ -1,21 +1,24 @@
-"""Node-ID and identity of one node (1018h, 2101h), and its LSS slave (CiA 305): requests on 7E5h in, answers for 7E4h out.
+"""The node-ID and identity of one node (1018h, 2101h), and its LSS slave (CiA 305).
 
-Feed every data frame of 7E5h to ``receive``; answers leave through ``send``. Nothing raises, whatever comes. No clock is needed: the slave
-has no time-outs.
+Pass every data frame of 7E5h to ``receive``. Answers for 7E4h are passed to ``send``. No input
+raises, and no clock is needed, because the slave has no time-outs.
 
-Where independent stacks (CANopenNode, Lely) disagree, the stricter reading holds:
+If independent stacks (CANopenNode, Lely) disagree, this slave follows the stricter reading:
 
-- Only frames of 8 bytes count (Lely takes shorter ones).
-- Selection and identification are sequences without a gap: any other LSS frame between breaks them (Lely keeps the place over some
-  services, CANopenNode takes selection frames in any order).
-- Unconfigured, to fastscan and to "identify non-configured", is a node whose active **and** pending node-ID are FFh (Lely lets every node
-  take part in a fastscan).
-- A fastscan begins with BitChecked = 80h (both stacks would also begin without), with LSSSub and LSSNext in 0..3.
-- A fastscan that has not come to its end is forgotten when the slave leaves the waiting state.
+- Only frames of 8 bytes count (Lely accepts shorter ones).
+- Selection and identification are sequences without a gap. Any other LSS frame within them ends the
+  sequence (Lely continues it after some services, CANopenNode accepts selection frames in any
+  order).
+- Only a node whose active **and** pending node-ID are FFh counts as unconfigured for fastscan and
+  "identify non-configured" (Lely lets every node take part in a fastscan).
+- A fastscan begins with BitChecked = 80h (both stacks would also begin without), with LSSSub and
+  LSSNext in 0..3.
+- An unfinished fastscan is forgotten when the slave leaves the waiting state.
 - "Inquire node-ID" answers with the active node-ID (Lely: the pending one while initialising).
 
-All agree, and so does the table of services by state in CiA 305: in configuration state a slave ignores "switch state selective", also that
-of another slave; only "switch state global" brings it back to waiting.
+Both stacks and the table of services by state in CiA 305 agree on the following. A slave in
+configuration state ignores "switch state selective", also if it selects another slave. Only
+"switch state global" returns it to the waiting state.
 """
 
 from collections import deque
@@ -45,10 +48,11 @@ class Service(IntEnum):
 
 
 _SELECT = range(0x40, 0x44)
-"""Command specifiers with one part each of the identity 1018h: vendor, product, revision, serial number."""
+"""Selection: one command specifier each for vendor, product, revision and serial number."""
 _INQUIRE = range(0x5A, 0x5E)
+"""Inquiry of the same four parts."""
 _IDENTIFY = range(0x46, 0x4C)
-"""Vendor, product, lowest and highest revision, lowest and highest serial number."""
+"""Identification: vendor, product, lowest and highest revision, lowest and highest serial."""
 
 OK = 0
 NODE_ID_OUT_OF_RANGE = 1
@@ -64,9 +68,10 @@ SCAN_RESET = 0x80
 
 
 class Identity:
-    """The node as LSS sees it.
+    """The node-ID and identity of one node, as LSS and 2101h read and change them.
 
-    ``taken``: whether another node of the gateway has a node-ID. ``boot``: called where an unconfigured node has got a node-ID.
+    ``taken`` returns True if another node of the gateway has a node-ID. ``boot`` is called with the
+    time when an unconfigured node received a node-ID.
     """
 
     def __init__(
@@ -85,52 +90,71 @@ class Identity:
         self._boot = boot
         bind = dictionary.bind
         bind(at.NODE_ID, 1, read=lambda _now: self.active_node_id)
-        check, read = self._check_node_id, lambda _now: self.pending_node_id
-        bind(at.NODE_ID, 2, read=read, check=check, written=self._written)
+        bind(
+            at.NODE_ID,
+            2,
+            read=lambda _now: self.pending_node_id,
+            check=self._check_node_id,
+            written=self._written,
+        )
         bind(at.NODE_ID, 3, read=lambda _now: settings.bitrate)
         bind(at.NODE_ID, 4, read=lambda _now: settings.bitrate)
 
     @property
     def pending_node_id(self) -> int:
-        """The node-ID from the next reset communication on: as set over the bus, else as configured."""
-        given = self._parameters.set_node_id
-        return self._settings.node_id if given is None else given
+        """The node-ID after the next reset communication.
+
+        It is the one set over the bus, or else the configured one.
+        """
+        set_over_bus = self._parameters.set_node_id
+        return self._settings.node_id if set_over_bus is None else set_over_bus
 
     @property
     def identity(self) -> tuple[int, int, int, int]:
-        """1018h:1..4."""
+        """Vendor, product, revision and serial number (1018h:1..4)."""
         number = self._dictionary.number
+        vendor = number(0x1018, 1)
+        product = number(0x1018, 2)
+        revision = number(0x1018, 3)
         serial = number(0x1018, 4, otherwise=self._settings.serial)
-        return number(0x1018, 1), number(0x1018, 2), number(0x1018, 3), serial
+        return vendor, product, revision, serial
 
     def activate(self) -> int:
-        """Reset communication: the pending node-ID holds from now on."""
+        """Make the pending node-ID the active one at a reset communication, and return it."""
         self.active_node_id = self.pending_node_id
         return self.active_node_id
 
     def configure_node_id(self, node_id: int) -> bool:
-        """A new node-ID for the next reset communication. False where writing is switched off or another node of ours has it."""
-        if self._settings.read_only or (node_id != UNCONFIGURED and self._taken(node_id)):
+        """Set the node-ID for the next reset communication.
+
+        False if writing is switched off or another node of the gateway has the node-ID.
+        """
+        if self._settings.read_only:
+            return False
+        if node_id != UNCONFIGURED and self._taken(node_id):
             return False
         self._parameters.set_node_id = node_id
         return True
 
     def store_configuration(self) -> bool:
-        """LSS: begin to save the pending node-ID. False: refused.
+        """Begin to save the pending node-ID for LSS. False if this is refused.
 
-        After True exactly one call of ``LssSlave.stored`` follows, in the order of the requests, also when the node was reset between.
+        After True, exactly one call of ``LssSlave.stored`` follows, in the order of the requests,
+        even if the node was reset in the meantime.
         """
         return not self._settings.read_only and self._parameters.store_node_id()
 
     def lss_left_configuration(self, now: int) -> None:
-        """The slave was switched from configuration to waiting state."""
+        """Boot the node if it received its first node-ID in the configuration state."""
         if self.active_node_id == UNCONFIGURED and self.pending_node_id != UNCONFIGURED:
             self._boot(now)
 
     def _check_node_id(self, value: int) -> None:
-        """Checks a new 2101h:2.
+        """Check a new 2101h:2.
 
-        The EDS permits 255, because tools add its $NODEID for a node that has no node-ID yet.
+        SdoAbort 06090031h or 06090032h unless it is 1..127, 06040043h for the node-ID of another
+        node of the gateway. The EDS permits 255, because tools add its $NODEID for a node that has
+        no node-ID yet.
         """
         if value > 127:
             raise SdoAbort(Abort.TOO_HIGH)
@@ -144,67 +168,77 @@ class Identity:
 
 
 class LssSlave:
-    """Configures one node, selected by its identity (1018h). Several slaves hear the same frames, each answers for itself only."""
+    """The LSS slave of one node, which is selected by its identity (1018h).
+
+    All slaves of the gateway receive the same frames. Each answers for its own node only.
+    """
 
     def __init__(self, host: Identity, send: Callable[[bytes], None]) -> None:
         self._host = host
         self._send = send
         self._configuring = False
         self._expected = 0
-        """What continues the selection or identification under way; 0: none is."""
+        """Command specifier that continues the present selection or identification, else 0."""
         self._scanned: int | None = None
-        """LSSPos, the part of the identity (0..3) that a fastscan looks at; None: no fastscan under way."""
+        """LSSPos, the part of the identity (0..3) that is scanned. None without a fastscan."""
         self._stores: deque[bool] = deque()
-        """Savings under way, oldest first: whether the master still waits for the answer."""
+        """For each pending save, oldest first: True if the master still waits for the answer."""
 
     @property
     def configuring(self) -> bool:
-        """Whether this is the LSS configuration state (else: waiting)."""
+        """True in the LSS configuration state, False in the waiting state."""
         return self._configuring
 
     def reset(self) -> None:
-        """Back to waiting state, at an NMT reset: partial selections and scans are forgotten, a late result of a saving is not sent."""
+        """Return to the waiting state at an NMT reset.
+
+        Unfinished selections and scans are forgotten. Results of pending saves are not sent.
+        """
         self._enter(configuring=False)
 
     def receive(self, data: bytes, now: int) -> None:
-        """Take a data frame of 7E5h. Other lengths than 8 bytes, unknown services and services of the other state are ignored."""
+        """Serve a data frame of 7E5h.
+
+        Ignored are other lengths than 8 bytes, unknown services and services of the other state.
+        """
         if len(data) != 8:
             return
-        service, number = data[0], int.from_bytes(data[1:5], "little")
-        expected, self._expected = self._expected, 0
+        service = data[0]
+        number = int.from_bytes(data[1:5], "little")
+        expected = self._expected
+        self._expected = 0
         if service == Service.SWITCH_GLOBAL:
             self._switch_global(data[1], now)
         elif service in _IDENTIFY:
-            if self._sequence_ends(
-                _IDENTIFY, service, expected, self._is_in_range(service, number)
-            ):
+            is_match = self._is_in_range(service, number)
+            if self._completes(_IDENTIFY, service, expected, is_match):
                 self._answer(Service.IDENTIFIED)
         elif service == Service.IDENTIFY_NON_CONFIGURED:
-            if self._unconfigured:
+            if self._is_unconfigured:
                 self._answer(Service.NON_CONFIGURED)
         elif self._configuring:
             self._configure(service, data)
         elif service in _SELECT:
-            fits = self._host.identity[service - _SELECT[0]] == number
-            if self._sequence_ends(_SELECT, service, expected, fits):
+            own = self._host.identity[service - _SELECT[0]]
+            if self._completes(_SELECT, service, expected, own == number):
                 self._enter(configuring=True)
                 self._answer(Service.SELECTED)
-        elif service == Service.FASTSCAN and self._unconfigured:
+        elif service == Service.FASTSCAN and self._is_unconfigured:
             self._fastscan(number, *data[5:])
 
     def stored(self, ok: bool) -> None:
-        """Report the result of the oldest saving under way.
+        """Answer with the result of the oldest pending save.
 
-        Not answered if the slave has left the configuration state since: another slave may be the selected one by now.
+        Nothing is sent if the slave left the configuration state in the meantime, because another
+        slave may be selected now.
         """
         if self._stores and self._stores.popleft():
             self._answer(Service.STORE, OK if ok else STORE_FAILED)
 
     @property
-    def _unconfigured(self) -> bool:
-        return (
-            self._host.active_node_id == UNCONFIGURED and self._host.pending_node_id == UNCONFIGURED
-        )
+    def _is_unconfigured(self) -> bool:
+        host = self._host
+        return host.active_node_id == UNCONFIGURED and host.pending_node_id == UNCONFIGURED
 
     def _enter(self, configuring: bool) -> None:
         self._configuring = configuring
@@ -217,28 +251,34 @@ class LssSlave:
         if mode == 1:
             self._enter(configuring=True)
         elif mode == 0:
-            left = self._configuring
+            was_configuring = self._configuring
             self._enter(configuring=False)
-            if left:
+            if was_configuring:
                 self._host.lss_left_configuration(now)
 
-    def _sequence_ends(self, services: range, service: int, expected: int, fits: bool) -> bool:
-        """Whether this frame completes a selection or identification that fits in all its parts."""
-        if not fits or service not in (services[0], expected):
+    def _completes(self, services: range, service: int, expected: int, is_match: bool) -> bool:
+        """Return True if this frame completes a selection or identification of this node.
+
+        ``is_match`` is True if this frame's part matches the node.
+        """
+        if not is_match or service not in (services[0], expected):
             return False
         self._expected = service + 1 if service != services[-1] else 0
         return not self._expected
 
     def _is_in_range(self, service: int, number: int) -> bool:
-        """Whether one part of an identification fits."""
+        """Return True if this part of an identification matches the node."""
         vendor, product, revision, serial = self._host.identity
-        if service < _IDENTIFY[2]:
-            return number == (vendor, product)[service - _IDENTIFY[0]]
+        if service == _IDENTIFY[0]:
+            return number == vendor
+        if service == _IDENTIFY[1]:
+            return number == product
         own = revision if service < _IDENTIFY[4] else serial
-        return own >= number if service in _IDENTIFY[2::2] else own <= number
+        is_lowest = service in (_IDENTIFY[2], _IDENTIFY[4])
+        return own >= number if is_lowest else own <= number
 
     def _fastscan(self, number: int, bit_checked: int, sub: int, following: int) -> None:
-        """51h | IDNumber u32 | BitChecked 0..31 or 80h | LSSSub 0..3 | LSSNext 0..3."""
+        """Serve 51h, IDNumber (4), BitChecked 0..31 or 80h, LSSSub 0..3, LSSNext 0..3."""
         if sub > 3 or following > 3:
             return
         if bit_checked == SCAN_RESET:
@@ -250,17 +290,20 @@ class LssSlave:
         if (number ^ self._host.identity[sub]) >> bit_checked:
             return
         self._scanned = following
-        # LSSNext < LSSSub with every bit checked: the master has come to the last part it looks at.
+        # LSSNext < LSSSub with every bit checked: the master has finished the last part
         if bit_checked == 0 and following < sub:
             self._enter(configuring=True)
         self._answer(Service.IDENTIFIED)
 
     def _configure(self, service: int, data: bytes) -> None:
-        """Serve what only a slave in configuration state does. Activate bit timing (15h) has no answer, and here no effect."""
+        """Serve the services of the configuration state.
+
+        Activate bit timing (15h) has no answer, and no effect here.
+        """
         if service == Service.CONFIGURE_NODE_ID:
             self._configure_node_id(data[1])
         elif service == Service.CONFIGURE_BIT_TIMING:
-            self._answer(service, BIT_TIMING_NOT_SUPPORTED)  # the bit rate belongs to the system
+            self._answer(service, BIT_TIMING_NOT_SUPPORTED)  # the system sets the bit rate
         elif service == Service.STORE:
             if self._host.store_configuration():
                 self._stores.append(True)

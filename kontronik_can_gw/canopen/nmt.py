@@ -1,5 +1,7 @@
-"""Network management, slave side: states and commands (CiA 301, 7.2.8.2 and 7.3.2), objects 1029h and 1F80h; the heartbeat's tick (1017h)
-and the watch over those of other nodes (1016h; 7.2.8.2.2 and 7.5.2.19/20).
+"""Network management (NMT) of one node: its states, its heartbeat and its watch over other nodes.
+
+States and commands follow CiA 301, 7.2.8.2 and 7.3.2, with the objects 1029h and 1F80h. The
+producer of heartbeats has the object 1017h, the consumer 1016h (7.2.8.2.2 and 7.5.2.19/20).
 """
 
 from collections.abc import Callable, Iterator
@@ -13,7 +15,10 @@ from kontronik_can_gw.times import MS, NEVER, SECOND
 
 _SELF_START_OFF = 4
 _CATCHING_UP_NS = SECOND // 2
-"""After a hold-up no heartbeat is missed for this long unless it was seen to be late: what came meanwhile is read piece by piece."""
+"""After a hold-up, a heartbeat counts as missing only after this time, or if it was seen late.
+
+Frames that arrived during the hold-up are read in several turns of the loop.
+"""
 
 
 class Command(IntEnum):
@@ -28,7 +33,7 @@ class Command(IntEnum):
 
 RESETS = (Command.RESET_NODE, Command.RESET_COMMUNICATION)
 ALL_NODES = 0
-"""The node-ID in a command to every node on the bus."""
+"""The node-ID of a command to all nodes on the bus."""
 STATE_AFTER = {
     Command.START: NmtState.OPERATIONAL,
     Command.STOP: NmtState.STOPPED,
@@ -37,21 +42,22 @@ STATE_AFTER = {
 
 
 def command(data: bytes, node_id: int) -> Command | None:
-    """The command that an NMT message holds for this node: byte 0 command, byte 1 node-ID or ALL_NODES.
+    """Return the command of an NMT message: byte 0 command, byte 1 node-ID or ALL_NODES.
 
-    None for commands to other nodes, unknown, or not exactly two bytes long.
+    None for commands to other nodes, unknown commands, and data that is not two bytes long.
     """
-    if (
-        len(data) != 2
-        or data[1] not in (ALL_NODES, node_id)
-        or data[0] not in Command._value2member_map_
-    ):
+    if len(data) != 2 or data[1] not in (ALL_NODES, node_id):
+        return None
+    if data[0] not in Command._value2member_map_:
         return None
     return Command(data[0])
 
 
 class Nmt:
-    """The state machine of one node. ``entered`` is called with the time after each change of state by ``enter``."""
+    """The NMT state machine of one node.
+
+    ``entered`` is called with the time after each change of state by ``enter``.
+    """
 
     def __init__(
         self, dictionary: Dictionary, self_start: bool, entered: Callable[[int], None]
@@ -64,18 +70,18 @@ class Nmt:
 
     @property
     def starts_itself(self) -> bool:
-        """Whether the node enters OPERATIONAL without a command: bit 2 of 1F80h is 0."""
+        """True if the node enters OPERATIONAL without a command: bit 2 of 1F80h is 0."""
         otherwise = 0 if self._self_start else None
         return not self._dictionary.number(0x1F80, otherwise=otherwise) & _SELF_START_OFF
 
     @property
     def communicates(self) -> bool:
-        """Whether SDO, SYNC and EMCY work: PRE-OPERATIONAL or OPERATIONAL."""
+        """True if SDO, SYNC and EMCY work: PRE-OPERATIONAL or OPERATIONAL."""
         return self.state in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
 
     @property
     def boots_after_outage(self) -> bool:
-        """1029h:1 = 0."""
+        """True if the node boots after bus-off or an outage of the interface: 1029h:1 is 0."""
         return self._dictionary.number(0x1029, 1) == 0
 
     def enter(self, state: NmtState, now: int) -> None:
@@ -84,7 +90,11 @@ class Nmt:
             self._entered(now)
 
     def behave(self, error: int, now: int) -> None:
-        """Follow 1029h: sub-index 1 communication error, 2 telemetry lost. 0 PRE-OPERATIONAL (if OPERATIONAL), 1 no change, 2 STOPPED."""
+        """Change the state after an error as 1029h requires.
+
+        ``error`` is the sub-index: 1 for a communication error, 2 for lost telemetry. The value 0
+        means PRE-OPERATIONAL if the node is OPERATIONAL, 1 no change, 2 STOPPED.
+        """
         behaviour = self._dictionary.number(0x1029, error)
         if behaviour == 0 and self.state is NmtState.OPERATIONAL:
             self.enter(NmtState.PRE_OPERATIONAL, now)
@@ -93,13 +103,16 @@ class Nmt:
 
 
 def _check_startup(value: int) -> None:
-    """A new 1F80h of a slave: only the bits about starting by itself (2) and starting others (3, without meaning here)."""
+    """Check a new 1F80h. SdoAbort 06090030h for other bits than 2 and 3.
+
+    Bit 2 is about starting by itself, and bit 3 about starting others, which a slave ignores.
+    """
     if value & ~0x0C:
         raise SdoAbort(Abort.VALUE)
 
 
 class Producer:
-    """Has heartbeats sent. A period of 0 produces none."""
+    """Sends heartbeats at the period of 1017h. With a period of 0 it sends no heartbeats."""
 
     def __init__(self, dictionary: Dictionary, send: Callable[[], None]) -> None:
         self.due = NEVER
@@ -109,21 +122,22 @@ class Producer:
         dictionary.bind(0x1017, written=self.configure)
 
     def configure(self, now: int) -> None:
-        """Take over 1017h. A changed period holds from now on: the first heartbeat comes one period later."""
+        """Take over 1017h. The next heartbeat is sent one new period from now."""
         self._period = self._dictionary.number(0x1017) * MS
         self.due = now + self._period if self._period else NEVER
 
     def stop(self) -> None:
-        """Produce none, whatever 1017h is: the node has no node-ID."""
-        self._period, self.due = 0, NEVER
+        """Send no heartbeats, whatever 1017h is, because the node has no node-ID."""
+        self._period = 0
+        self.due = NEVER
 
     def beat(self, now: int) -> None:
-        """Let the next one come at once, if there are any."""
+        """Make the next heartbeat due now, unless 1017h is 0."""
         if self._period:
             self.due = now
 
     def advance(self, now: int) -> None:
-        """Send one if it is due. Missed ones are not made up for: one heartbeat says all."""
+        """Send a heartbeat if it is due. Missed heartbeats are not sent later."""
         if now < self.due:
             return
         self.due += self._period
@@ -134,16 +148,18 @@ class Producer:
 
 @dataclass
 class _Watched:
-    timeout: int
-    due: int = NEVER  # the watch begins with the first heartbeat
-    lost: bool = False
+    """The watch over one node. It begins with the first heartbeat."""
+
+    timeout_ns: int
+    due: int = NEVER
+    is_lost: bool = False
 
 
 class Consumer:
-    """The watch over other nodes (1016h).
+    """The watch over heartbeats of other nodes (1016h).
 
-    ``changed`` is called with a node-ID, whether its heartbeat is lost (or no longer), the time,
-    and the time at which that happened.
+    ``changed`` is called with a node-ID, True if its heartbeat is lost (False if it is back), the
+    time, and the time at which the change happened.
     """
 
     def __init__(
@@ -158,7 +174,7 @@ class Consumer:
             variable.written = self._written
 
     def reset(self) -> None:
-        """All watches begin anew."""
+        """Start all watches from the beginning."""
         self._watched = {}
         self._configure()
 
@@ -173,66 +189,83 @@ class Consumer:
         return max(self._judged_from, min(watched.due for watched in self._watched.values()))
 
     def held_up(self, now: int) -> None:
-        """The process was held up until ``now``: a heartbeat may still wait to be read."""
+        """Note that the process was held up until ``now``, so that heartbeats may still be unread."""
         self._judged_from = now + _CATCHING_UP_NS
 
     def receive(self, node_id: int, data: bytes, now: int, at: int) -> None:
-        """A heartbeat (or boot-up message) that came ``at``."""
+        """Note a heartbeat or boot-up message that arrived ``at``."""
         watched = self._watched.get(node_id)
         if len(data) != 1 or watched is None:
             return
-        self._judge(at, now)  # it may have come too late, and others not at all
-        watched.due = at + watched.timeout
-        if watched.lost:
-            watched.lost = False
+        self._report_late(at, now)  # also this heartbeat may be late
+        watched.due = at + watched.timeout_ns
+        if watched.is_lost:
+            watched.is_lost = False
             self._changed(node_id, False, now, at)
 
     def advance(self, now: int) -> None:
-        """Let time pass."""
+        """Report heartbeats that are missing now."""
         if now >= self._judged_from:
-            self._judge(now, now)
+            self._report_late(now, now)
 
-    def _judge(self, until: int, now: int) -> None:
-        late = {node_id: each for node_id, each in self._watched.items() if until >= each.due}
-        times = {node_id: watched.due for node_id, watched in late.items()}
-        for watched in late.values():
-            watched.due = NEVER
-            watched.lost = True
+    def _report_late(self, until: int, now: int) -> None:
+        """Report the heartbeats that were due before ``until``."""
+        times: dict[int, int] = {}
+        for node_id, watched in self._watched.items():
+            if until >= watched.due:
+                times[node_id] = watched.due
+                watched.due = NEVER
+                watched.is_lost = True
         for node_id, due in times.items():
             self._changed(node_id, True, now, due)
 
     def _configure(self) -> None:
-        """Take over 1016h. A watch that stays as it was goes on."""
-        before, self._watched = self._watched, {}
-        for node_id, timeout in self._entries():
-            old = before.get(node_id)
-            kept = old if old is not None and old.timeout == timeout else None
-            self._watched[node_id] = kept or _Watched(timeout)
+        """Take over 1016h. Unchanged watches continue."""
+        before = self._watched
+        self._watched = {}
+        for node_id, timeout_ns in self._entries():
+            watched = before.get(node_id)
+            if watched is None or watched.timeout_ns != timeout_ns:
+                watched = _Watched(timeout_ns)
+            self._watched[node_id] = watched
 
     def _written(self, now: int) -> None:
         before = self._watched
         self._configure()
         for node_id, old in before.items():
-            if old.lost and self._watched.get(node_id) is not old:
+            if old.is_lost and self._watched.get(node_id) is not old:
                 self._changed(node_id, False, now, now)
 
     def _check(self, own: Variable, value: int) -> None:
-        """A new entry. SdoAbort 06040043h where another entry watches the node already (CiA 301, 7.5.2.19)."""
+        """Check a new entry (CiA 301, 7.5.2.19).
+
+        SdoAbort 06090030h for reserved bits, 06040043h if another entry watches the node already.
+        """
         if value >> 24:
             raise SdoAbort(Abort.VALUE)  # reserved bits
-        used = _used(value)
-        if used is not None and used[0] in dict(self._entries(own)):
+        watch = _watch_of(value)
+        if watch is not None and watch[0] in dict(self._entries(own)):
             raise SdoAbort(Abort.INCOMPATIBLE)
 
-    def _entries(self, but: Variable | None = None) -> Iterator[tuple[int, int]]:
+    def _entries(self, skipped: Variable | None = None) -> Iterator[tuple[int, int]]:
+        """Yield node-ID and time in ns of each used entry, except a skipped one."""
         for variable in self._dictionary.subs(0x1016):
-            if variable is not but and (used := _used(variable.value)) is not None:
-                yield used
+            if variable is skipped:
+                continue
+            watch = _watch_of(variable.value)
+            if watch is not None:
+                yield watch
 
 
-def _used(value: Value) -> tuple[int, int] | None:
-    """An entry's node-ID (bits 23..16) and time (bits 15..0, ms) in ns; None where either is none."""
+def _watch_of(value: Value) -> tuple[int, int] | None:
+    """Return an entry's node-ID (bits 23..16) and its time (bits 15..0, ms) in ns.
+
+    None for an unused entry: the time is 0, or the node-ID is not 1..127.
+    """
     if not isinstance(value, int):
         return None
-    node_id, timeout = value >> 16 & 0xFF, (value & 0xFFFF) * MS
-    return (node_id, timeout) if 1 <= node_id <= 127 and timeout else None
+    node_id = value >> 16 & 0xFF
+    timeout_ns = (value & 0xFFFF) * MS
+    if not 1 <= node_id <= 127 or not timeout_ns:
+        return None
+    return node_id, timeout_ns

@@ -87,10 +87,12 @@ def make_dictionary(
         power_on[0x1018, 1] = settings.vendor_id
     power_on[0x1018, 4] = settings.serial
     for (index, sub), given in power_on.items():
-        if (variable := dictionary.get(index, sub)) is not None:
+        variable = dictionary.get(index, sub)
+        if variable is not None:
             variable.power_on = given
-    if settings.self_start and (variable := dictionary.get(0x1F80)) is not None:
-        variable.power_on = int(variable.power_on) & ~_SELF_START_OFF
+    startup = dictionary.get(0x1F80)
+    if startup is not None and settings.self_start:
+        startup.power_on = int(startup.power_on) & ~_SELF_START_OFF
     dictionary.read_only = settings.read_only
     dictionary.reset(APPLICATION, settings.node_id, stored.application)
     return dictionary

@@ -1,7 +1,8 @@
-"""Which objects show what: index and sub-index to a value, in which steps. What is not here is plain storage or a service's own object.
+"""The objects that show values of an ESC or of the gateway, with their steps.
 
-Values of ESC and gateway stand in ``objects.tsv``, those of the link here. The objects' types, names, limits and PDO defaults are in
-the EDS; the values, units and ranges in ``VALUES``.
+``objects.tsv`` lists the values of the ESC and the gateway. The values of the link are defined
+here. All other objects store their values or are bound to a service. The EDS holds the types,
+names, limits and PDO defaults of objects, and ``VALUES`` the units and ranges of values.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,53 +27,71 @@ from kontronik_can_gw.esc.values import (
 from kontronik_can_gw.status import GatewayState, GatewayStatus
 from kontronik_can_gw.times import MS
 
-U8, U16 = 0xFF, 0xFFFF
-LIVE, DERIVED, INFO, EXTREMES, LINK, GATEWAY = 0x2000, 0x2001, 0x2010, 0x2011, 0x2020, 0x2021
+U8 = 0xFF
+U16 = 0xFFFF
+LIVE = 0x2000
+DERIVED = 0x2001
 UNITS = 0x2002
-SETTINGS, NODE_ID, RESET_STATISTICS = 0x2100, 0x2101, 0x2102
+INFO = 0x2010
+EXTREMES = 0x2011
+LINK = 0x2020
+GATEWAY = 0x2021
+SETTINGS = 0x2100
+NODE_ID = 0x2101
+RESET_STATISTICS = 0x2102
 ERROR_CODE = 0x603F
 
 _TABLE = Path(__file__).with_name("objects.tsv")
 _ROLL = frozenset({(DERIVED, 4), (DERIVED, 6)})
-"""These start again at 0 after the greatest number of their type."""
+"""Objects that restart at 0 after the highest number of their type."""
 _STATUS = frozenset({"operating_errors", "operating_state_raw", "link_status"})
-"""A change of these is news by itself; a PDO that carries one is sent on that change."""
+"""Values of status objects. A PDO that carries one is sent when it changes."""
 
 
 @dataclass(frozen=True)
 class Bound:
-    """A value as an object shows it: ``steps`` steps to one of the value's units."""
+    """A value as an object shows it: in ``steps`` steps per unit of the value."""
 
     source: Value
     steps: Fraction
 
     @property
     def status(self) -> bool:
-        """True if a change of it is news by itself (errors, state, link)."""
+        """True if a change causes a PDO: errors, operating state and link status."""
         return self.source.name in _STATUS
 
     @property
     def slope(self) -> Fraction:
-        """Steps of the object for one of the value."""
+        """Steps of the object per step of the value."""
         return self.steps / self.source.per_unit
 
     def read(self, esc: EscTelemetry, gateway: GatewayStatus, now: int, high: int) -> int | None:
-        """What the object shows now. ``high``: a counter starts again at 0 after it. None: not available."""
-        return self._shown(esc, steps(self.source, esc, gateway, now), high)
+        """Return the number that the object shows now. None if the value is not available.
+
+        A counter restarts at 0 after ``high``.
+        """
+        value = steps(self.source, esc, gateway, now)
+        return self._shown(esc, value, high)
 
     def last(self, esc: EscTelemetry, high: int) -> int | None:
-        """What the object shows of the last live data, fresh or not."""
-        return self._shown(esc, steps_of(self.source, esc, esc.last_live), high)
+        """Return the number that the object shows of the last live data, fresh or not."""
+        value = steps_of(self.source, esc, esc.last_live)
+        return self._shown(esc, value, high)
 
-    def _shown(self, esc: EscTelemetry, found: int | None, high: int) -> int | None:
-        value = scaled(self.source, esc, found, self.slope)
-        return value % (high + 1) if value is not None and self.source.rolls else value
+    def _shown(self, esc: EscTelemetry, value: int | None, high: int) -> int | None:
+        shown = scaled(self.source, esc, value, self.slope)
+        if shown is not None and self.source.rolls:
+            return shown % (high + 1)
+        return shown
 
 
-def _of_link(name: str, read: Callable[[EscTelemetry], int], pace: Group | None = None) -> Value:
-    """A counter as the objects show it: since it was reset."""
+def _counter(name: str, read: Callable[[EscTelemetry], int], pace: Group | None = None) -> Value:
+    """Return a counter of the link, which restarts at 0."""
     return Value(
-        *(name, "", Group.LINK, Kind.OBJECT),
+        name,
+        "",
+        Group.LINK,
+        Kind.OBJECT,
         read=lambda esc, _gateway, _now: read(esc),
         low=0,
         rolls=True,
@@ -81,64 +100,80 @@ def _of_link(name: str, read: Callable[[EscTelemetry], int], pace: Group | None 
 
 
 def _age(name: str, stamp: Callable[[EscTelemetry], int | None]) -> Value:
-    """In milliseconds; FFFEh: that old or older, FFFFh: nothing has come yet."""
+    """Return an age in ms. FFFEh means this age or more, and FFFFh that nothing arrived yet.
+
+    ``stamp`` returns the time of arrival, or None.
+    """
 
     def read(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> int:
         at = stamp(esc)
-        return U16 if at is None else min(max(0, now - at) // MS, U16 - 1)
+        if at is None:
+            return U16
+        age_ms = max(0, now - at) // MS
+        return min(age_ms, U16 - 1)
 
     return Value(name, "ms", Group.LINK, Kind.OBJECT, read=read, low=0, high=U16)
 
 
 def link_status(esc: EscTelemetry, gateway: GatewayStatus, _now: int) -> int:
-    return esc.link | (gateway.state is GatewayState.REPLAY) << 6 | (esc.info is not None) << 7
+    """Return 2020h:1: bits 0..5 link state, bit 6 replay, bit 7 fresh information."""
+    is_replay = gateway.state is GatewayState.REPLAY
+    has_info = esc.info is not None
+    return esc.link | is_replay << 6 | has_info << 7
 
 
 def _kept(value: Value) -> Value:
-    """Information of the ESC keeps its value while telemetry is lost; bit 7 of the link status shows that it is not fresh."""
+    """Return a value of the information frame that stays while telemetry is lost.
+
+    Bit 7 of the link status shows that it is not fresh.
+    """
     return replace(value, group=Group.LINK, last=True, optional=True, pace=Group.INFO)
 
 
 def _firmware(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | None:
-    value, info = esc.protocol.value, esc.last_info
-    main, sub = value("firmware_main", info), value("firmware_sub", info)
-    return None if main is None or sub is None else main << 8 | sub
+    """Return the main version times 256, plus the sub version. None if unknown."""
+    main = esc.protocol.value("firmware_main", esc.last_info)
+    sub = esc.protocol.value("firmware_sub", esc.last_info)
+    if main is None or sub is None:
+        return None
+    return main << 8 | sub
 
 
 _FIRMWARE = Value("firmware", "", Group.INFO, Kind.OBJECT, read=_firmware, low=0, high=U16)
 _LINK_VALUES = {
     1: Value("link_status", "", Group.LINK, Kind.OBJECT, read=link_status, low=0, high=U8),
-    2: _of_link("live_counter", lambda esc: esc.counters.live, Group.LIVE),
+    2: _counter("live_counter", lambda esc: esc.counters.live, Group.LIVE),
     3: _age("data_age", lambda esc: esc.live_ns),
     4: _age("info_age", lambda esc: esc.last_info_ns),
-    5: _of_link("live_frames", lambda esc: esc.counters.live - esc.base.live),
-    6: _of_link("info_frames", lambda esc: esc.counters.info - esc.base.info),
-    7: _of_link("crc_errors", lambda esc: esc.counters.crc_errors - esc.base.crc_errors),
-    8: _of_link("line_errors", lambda esc: esc.line_errors - esc.base_line_errors),
-    9: _of_link("dropped_bytes", lambda esc: esc.counters.dropped_bytes - esc.base.dropped_bytes),
-    10: _of_link("losses", lambda esc: esc.losses - esc.base_losses),
+    5: _counter("live_frames", lambda esc: esc.counters.live - esc.base.live),
+    6: _counter("info_frames", lambda esc: esc.counters.info - esc.base.info),
+    7: _counter("crc_errors", lambda esc: esc.counters.crc_errors - esc.base.crc_errors),
+    8: _counter("line_errors", lambda esc: esc.line_errors - esc.base_line_errors),
+    9: _counter("dropped_bytes", lambda esc: esc.counters.dropped_bytes - esc.base.dropped_bytes),
+    10: _counter("losses", lambda esc: esc.losses - esc.base_losses),
     11: VALUES["frame_rate"],
 }
 
 
 @cache
 def bindings_of(protocol: EscProtocol) -> Mapping[tuple[int, int], Bound]:
-    """(Index, sub-index) to what the object shows of an ESC of this protocol."""
+    """Return the values that objects show of an ESC of this protocol, by index and sub-index."""
     values = {**values_of(protocol), _FIRMWARE.name: _FIRMWARE}
-    found = {}
+    bindings: dict[tuple[int, int], Bound] = {}
     for line in _TABLE.read_text(encoding="ascii").splitlines()[1:]:
-        at, number, name, per_unit = line.split("\t")
-        index, sub, value = int(at, 16), int(number), values[name]
+        index_text, sub_text, name, steps_per_unit = line.split("\t")
+        index = int(index_text, 16)
+        sub = int(sub_text)
+        value = values[name]
         if index in (INFO, EXTREMES):
             value = _kept(value)
         elif (index, sub) in _ROLL:
             value = replace(value, rolls=True)
-        found[index, sub] = Bound(value, Fraction(per_unit))
-    link = {
-        (LINK, sub): Bound(value, Fraction(value.per_unit)) for sub, value in _LINK_VALUES.items()
-    }
-    return found | link
+        bindings[index, sub] = Bound(value, Fraction(steps_per_unit))
+    for sub, value in _LINK_VALUES.items():
+        bindings[LINK, sub] = Bound(value, Fraction(value.per_unit))
+    return bindings
 
 
 BINDINGS = bindings_of(PROTOCOLS[0])
-"""Those of an ESC whose configuration names no protocol; the objects are the same for all."""
+"""Bindings of the default protocol. Their objects are the same for all protocols."""

@@ -1,11 +1,14 @@
-"""Transmit PDOs, 180xh and 1A0xh: parameters, the rules by which a master may change them, SYNC (CiA 301, 7.2.2 and 7.5.2.37/38).
+"""Transmit PDOs: objects 180xh and 1A0xh, and the rules by which a master may change them.
 
-The core sends them: each is one of its slots. The bytes of a PDO come from a compiled plan like those of a DBC message, straight from the
-ESC's snapshot.
+See CiA 301, 7.2.2 and 7.5.2.37/38. Each PDO is one of the core's slots, and the core sends it. The
+bytes of a PDO come from a compiled plan, like the bytes of a DBC message, directly from the ESC's
+snapshot.
 
-Event of types 254 and 255: new data of what is mapped (a UART frame, a second, a download). A PDO that carries a status object (errors,
-operating state, link status) is sent when one of these changes instead. When telemetry is lost, PDOs with live values stop, unless they
-carry the link status: those go on, with all ones (80..0h for signed types) for what is not available.
+The event of types 254 and 255 is new data of a mapped object: a UART frame, a second, or a
+download. A PDO that carries a status object (errors, operating state, link status) is sent when one
+of these changes instead. When telemetry is lost, PDOs with live values stop, unless they carry the
+link status. These continue, and values that are not available have all bits set (80..0h for signed
+types).
 """
 
 from collections.abc import Callable, Sequence
@@ -20,9 +23,16 @@ from kontronik_can_gw.signals.plan import EXPECTED_LIVE_HZ
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
-COMMUNICATION, MAPPING = 0x1800, 0x1A00
+COMMUNICATION = 0x1800
+"""Index of the first PDO's communication parameters."""
+MAPPING = 0x1A00
+"""Index of the first PDO's mapping."""
 MAX_TPDOS = 512
-COB_ID, TYPE, INHIBIT, EVENT_TIMER, SYNC_START = 1, 2, 3, 5, 6
+COB_ID = 1
+TYPE = 2
+INHIBIT = 3
+EVENT_TIMER = 5
+SYNC_START = 6
 EVENT_TYPES = (254, 255)
 _FRAME_BIT = 1 << 29
 _MAX_BITS = 64
@@ -44,45 +54,56 @@ class Tpdo:
         self.valid = False
         self.type = 255
         """Transmission type."""
-        self.inhibit_ns = self.event_ns = 0
+        self.inhibit_ns = 0
+        self.event_ns = 0
         self.mapped: list[Variable] = []
-        """What is in the PDO; empty where nothing is."""
-        self.indices = index, mapping = COMMUNICATION + number, MAPPING + number
-        self.mappings = list(dictionary.subs(mapping))
+        """The mapped objects in the order of the frame."""
+        self.communication_index = COMMUNICATION + number
+        self.mapping_index = MAPPING + number
+        self.mappings = list(dictionary.subs(self.mapping_index))
         self._dictionary = dictionary
         self._taken = taken
         self._slot = slot
         self._plan: SlotPlan | None = None
         self._started = False
         self.sync = SyncTransmission(slot, status)
-        bind, written, check_entry = dictionary.bind, self.configure, self._check_entry
+        self._bind_objects()
+
+    def _bind_objects(self) -> None:
+        bind = self._dictionary.bind
+        index = self.communication_index
+        mapping = self.mapping_index
+        written = self.configure
         bind(index, COB_ID, check=self._check_cob_id, written=written)
-        bind(index, TYPE, check=self._check_type, written=written)
+        bind(index, TYPE, check=_check_type, written=written)
         bind(index, INHIBIT, check=self._check_while_invalid, written=written)
         bind(index, EVENT_TIMER, written=written)
         bind(index, SYNC_START, check=self._check_sync_start, written=written)
         bind(mapping, check=self._check_count, written=written)
         for variable in self.mappings:
-            bind(mapping, variable.entry.sub, check=check_entry, written=written)
+            bind(mapping, variable.entry.sub, check=self._check_entry, written=written)
 
     @property
     def sent(self) -> int:
-        """Frames so far."""
+        """Number of frames sent so far."""
         return self._slot.sent
 
     @property
     def on_change(self) -> bool:
-        """True if changes of a status object are what causes it."""
+        """True if the PDO is sent when a status object changes."""
         return self._plan is not None and self._plan.watched != 0
 
     @property
     def rate_hz(self) -> float:
-        """Usual frames a second with the UART at 100 Hz and SYNC at 10 Hz. Changes are not counted."""
+        """Usual frames per second with the UART at 100 Hz and SYNC at 10 Hz.
+
+        Frames caused by changes of a status object are not counted.
+        """
         return self._rate_hz(is_worst=False)
 
     @property
     def worst_rate_hz(self) -> float:
-        """The same if the status objects that cause it change all the time."""
+        """Frames per second if the status objects that cause the PDO change all the time."""
         return self._rate_hz(is_worst=True)
 
     def _rate_hz(self, is_worst: bool) -> float:
@@ -94,14 +115,16 @@ class Tpdo:
         if self.on_change and not is_worst:
             return cycle or 1.0
         events = EXPECTED_LIVE_HZ if self._plan.triggers & Event.LIVE else 1.0
-        return max(cycle, min(events, SECOND / self.inhibit_ns) if self.inhibit_ns else events)
+        if self.inhibit_ns:
+            events = min(events, SECOND / self.inhibit_ns)
+        return max(cycle, events)
 
     # --- parameters
 
     def read(self) -> None:
-        """Take over what the dictionary says. SdoAbort where something is mapped that cannot be."""
+        """Take over the parameters. SdoAbort if a mapped object cannot be mapped."""
         number = self._dictionary.number
-        index, mapping = self.indices
+        index = self.communication_index
         cob_id = number(index, COB_ID)
         self.cob_id = cob_id & 0x7FF
         self.valid = not cob_id & INVALID_BIT
@@ -109,113 +132,120 @@ class Tpdo:
         self.inhibit_ns = number(index, INHIBIT) * MS // 10
         self.event_ns = number(index, EVENT_TIMER) * MS
         self.sync.configure(self.type, number(index, SYNC_START))
-        self.mapped = self._resolve_all(number(mapping))
+        self.mapped = self._resolve_all(number(self.mapping_index))
 
     def check(self) -> None:
-        """Whether the parameters as they are make a PDO. SdoAbort if not."""
+        """SdoAbort unless the present parameters make a valid PDO."""
         _check_length(self.mapped)
-        self._check_type(self.type)
-        self._check_id(self._dictionary.number(self.indices[0], COB_ID))
+        _check_type(self.type)
+        self._check_id(self._dictionary.number(self.communication_index, COB_ID))
 
     def configure(self, now: int) -> None:
-        """Take over what the dictionary says. A PDO that begins to exist in OPERATIONAL begins like at its start."""
+        """Take over the parameters.
+
+        A PDO that becomes valid in OPERATIONAL begins as if the node had just been started.
+        """
         was_running = self._running
         self.read()
         self._plan = compile_pdo(self.mapped) if self.mapped else None
         settings = None
         if self.valid and self._plan is not None:
             by_event = self.type in EVENT_TYPES
-            times = (self.inhibit_ns, self.event_ns)
-            settings = SlotSettings(self._plan, self.cob_id, by_event, *times)
+            settings = SlotSettings(
+                self._plan, self.cob_id, by_event, self.inhibit_ns, self.event_ns
+            )
         if not was_running:
             self.sync.begin()
         self._slot.configure(settings, now)
 
     def reset(self, node_id: int, now: int) -> list[int]:
-        """Take over the parameters as they are after a reset. Returns the keys of those that were rejected.
+        """Take over the parameters after a reset. Returns the keys of the rejected ones.
 
-        Stored parameters that no longer make sense with this EDS give way to the defaults; without a free COB-ID there is no PDO.
+        Stored parameters that do not fit this EDS are replaced by the defaults. A PDO whose
+        default COB-ID is in use becomes invalid.
         """
         rejected = []
         try:
             self.read()
             self.check()
         except SdoAbort:
-            for number, variable in self._dictionary.variables.items():
-                if number >> 8 in self.indices:
-                    if variable.value != (default := variable.default(node_id)):
-                        rejected.append(number)
-                    variable.value = default
+            indices = (self.communication_index, self.mapping_index)
+            rejected = _restore_defaults(self._dictionary, indices, node_id)
             self.read()
-            cob_id = self._dictionary.get(self.indices[0], COB_ID)
+            cob_id = self._dictionary.get(self.communication_index, COB_ID)
             try:
                 self.check()
             except SdoAbort:
                 if cob_id is not None and self.valid:
                     cob_id.value = int(cob_id.value) | INVALID_BIT
-                    rejected.append(key(self.indices[0], COB_ID))
+                    rejected.append(key(self.communication_index, COB_ID))
         self.configure(now)
         return rejected
 
     def _resolve_all(self, count: int) -> list[Variable]:
-        number, mapping = self._dictionary.number, self.indices[1]
-        return [self.resolve(number(mapping, sub)) for sub in range(1, count + 1)]
+        number = self._dictionary.number
+        return [self.resolve(number(self.mapping_index, sub)) for sub in range(1, count + 1)]
 
     def resolve(self, mapping: int) -> Variable:
-        """The object of a mapping entry (index, sub-index, bits). SdoAbort where it cannot be mapped."""
-        index, sub, bits = mapping >> 16, mapping >> 8 & 0xFF, mapping & 0xFF
+        """Return the object of a mapping entry (index, sub-index, bits).
+
+        SdoAbort 06040041h if it cannot be mapped.
+        """
+        index = mapping >> 16
+        sub = mapping >> 8 & 0xFF
+        bits = mapping & 0xFF
         variable = self._dictionary.find(index, sub)
-        mappable = variable.entry.mappable and variable.readable
-        if not mappable or not bits_of(variable) or bits_of(variable) != bits:
+        is_mappable = variable.entry.mappable and variable.readable
+        size = bits_of(variable)
+        if not is_mappable or not size or size != bits:
             raise SdoAbort(Abort.NOT_MAPPABLE)
         return variable
 
     def _check_cob_id(self, value: int) -> None:
-        """A new 180xh:1.
+        """Check a new 180xh:1.
 
-        SdoAbort 06090030h for 29 bits, restricted ids, a change while the PDO exists, and a PDO with nothing mapped;
-        06040043h for an id in use.
+        SdoAbort 06090030h for 29-bit ids, restricted ids, another id while the PDO is valid, and
+        a PDO without mapped objects. SdoAbort 06040043h for an id in use.
         """
-        if not value & INVALID_BIT and (
-            not self.mapped or (self.valid and value & 0x7FF != self.cob_id)
-        ):
-            raise SdoAbort(Abort.VALUE)
+        if not value & INVALID_BIT:
+            is_other_id = value & 0x7FF != self.cob_id
+            if not self.mapped or (self.valid and is_other_id):
+                raise SdoAbort(Abort.VALUE)
         self._check_id(value)
 
     def _check_id(self, value: int) -> None:
-        # Bit 30, no RTR, may be 0: most masters write it so. An RTR is not answered either way.
+        # Bit 30 (no RTR) may be 0, because most masters write 0. RTRs are not answered anyway.
         if value & _FRAME_BIT or value & 0x1FFFF800:
             raise SdoAbort(Abort.VALUE)
         if not value & INVALID_BIT:
             check_free(value & 0x7FF, self, self._taken)
 
-    def _check_type(self, value: int) -> None:
-        """A new 180xh:2. Reserved types and 252, 253 (on request by RTR) are refused: 06090030h."""
-        if LAST_SYNC_TYPE < value < EVENT_TYPES[0]:
-            raise SdoAbort(Abort.VALUE)
-
     def _check_while_invalid(self, _value: int) -> None:
-        """Inhibit time and SYNC start value cannot change while the PDO exists: 06090030h."""
+        """SdoAbort 06090030h for a new inhibit time or SYNC start value while the PDO is valid."""
         if self.valid:
             raise SdoAbort(Abort.VALUE)
 
     def _check_sync_start(self, value: int) -> None:
-        """A new 180xh:6."""
+        """SdoAbort 06090030h for a new 180xh:6 above 240, or while the PDO is valid."""
         self._check_while_invalid(value)
         if value > LAST_SYNC_TYPE:
             raise SdoAbort(Abort.VALUE)
 
     def _check_count(self, count: int) -> None:
-        """A new 1A0xh:0. The PDO must not exist; the entries must be there and be 64 bits at most."""
+        """Check a new 1A0xh:0.
+
+        SdoAbort 06010000h while the PDO is valid, 06040042h if there are not so many entries or
+        if they have more than 64 bits, 06040041h for an object that cannot be mapped.
+        """
         if self.valid:
             raise SdoAbort(Abort.UNSUPPORTED_ACCESS)
-        if self._dictionary.get(self.indices[1], count) is None:
+        if self._dictionary.get(self.mapping_index, count) is None:
             raise SdoAbort(Abort.PDO_LENGTH)
         _check_length(self._resolve_all(count))
 
     def _check_entry(self, mapping: int) -> None:
-        """A new 1A0xh:1..8. The PDO must not exist and sub-index 0 must be 0, else 06010000h."""
-        if self.valid or self._dictionary.number(self.indices[1]):
+        """SdoAbort 06010000h for a new 1A0xh:1..8 unless the PDO is invalid and 1A0xh:0 is 0."""
+        if self.valid or self._dictionary.number(self.mapping_index):
             raise SdoAbort(Abort.UNSUPPORTED_ACCESS)
         if mapping:
             self.resolve(mapping)
@@ -227,42 +257,62 @@ class Tpdo:
         return self._started and self.valid and self._plan is not None
 
     def start(self, now: int) -> None:
-        """The node has become OPERATIONAL: event-driven PDOs say once what is."""
+        """Start because the node is OPERATIONAL. Event-driven PDOs send their values once."""
         self._started = True
         self.sync.begin()
         self._slot.start(now)
 
     def stop(self) -> None:
-        """No PDO outside OPERATIONAL."""
+        """Send no PDO until ``start``, because the node has left OPERATIONAL."""
         self._started = False
         self.sync.stop()
         self._slot.stop()
 
     def on_download(self, variable: Variable, now: int) -> None:
-        """An object was written over the bus."""
+        """Note new data if this object, written over the bus, is mapped."""
         if any(entry is variable for entry in self.mapped):
             self._slot.news(now)
 
     def repeat(self, now: int) -> None:
-        """Send once more what is sent on change only."""
+        """Send the PDO again if it is sent on changes only."""
         if self.on_change:
             self._slot.news(now)
 
     def on_sync(self, counter: int, now: int, answer: bool) -> None:
-        """Counts a SYNC, see SyncTransmission."""
+        """Count a SYNC, see ``SyncTransmission.on_sync``."""
         if self._running:
             self.sync.on_sync(counter, now, answer)
 
 
 def _check_length(mapped: Sequence[Variable]) -> None:
+    """SdoAbort 06040042h for more than 64 bits."""
     if sum(map(bits_of, mapped)) > _MAX_BITS:
         raise SdoAbort(Abort.PDO_LENGTH)
 
 
-class Tpdos(list[Tpdo]):
-    """All transmit PDOs of a node in ascending order, as many as the EDS has.
+def _check_type(value: int) -> None:
+    """SdoAbort 06090030h for a new 180xh:2 that is reserved, 252 or 253 (on request by RTR)."""
+    if LAST_SYNC_TYPE < value < EVENT_TYPES[0]:
+        raise SdoAbort(Abort.VALUE)
 
-    ``slot`` returns another slot of the core.
+
+def _restore_defaults(dictionary: Dictionary, indices: Sequence[int], node_id: int) -> list[int]:
+    """Set the variables of these indices to their defaults. Returns the keys of changed ones."""
+    changed = []
+    for number, variable in dictionary.variables.items():
+        if number >> 8 not in indices:
+            continue
+        default = variable.default(node_id)
+        if variable.value != default:
+            changed.append(number)
+        variable.value = default
+    return changed
+
+
+class Tpdos(list[Tpdo]):
+    """All transmit PDOs of the EDS in ascending order.
+
+    ``slot`` is called once for each PDO, and returns a slot of the core.
     """
 
     def __init__(
@@ -279,27 +329,27 @@ class Tpdos(list[Tpdo]):
         )
         self._held_up_ns = -NEVER
         self.due = NEVER
-        """When ``advance`` has something to do, or earlier."""
+        """A time not later than the first one at which ``advance`` has something to do."""
 
     def release_ids(self) -> None:
-        """What PDOs had is free for another."""
+        """Make all COB-IDs of PDOs available to others."""
         for tpdo in self:
             tpdo.valid = False
 
     def stop(self) -> None:
-        """No PDO outside OPERATIONAL."""
+        """Stop all PDOs, because the node has left OPERATIONAL."""
         for tpdo in self:
             tpdo.stop()
 
     def on_sync(self, counter: int, now: int, at: int) -> None:
-        """Counts a SYNC that arrived ``at``. A SYNC from before a hold-up is not answered."""
+        """Count a SYNC that arrived ``at``. A SYNC from before a hold-up is not answered."""
         answer = at > self._held_up_ns
         for tpdo in self:
             tpdo.on_sync(counter, now, answer)
             self.due = min(self.due, tpdo.sync.due)
 
     def advance(self, now: int) -> None:
-        """Sends the PDOs that wait for their turn after SYNCs that were read at once."""
+        """Send the PDOs that wait for their turn after several SYNCs were read at once."""
         if now < self.due:
             return
         for tpdo in self:
@@ -307,10 +357,10 @@ class Tpdos(list[Tpdo]):
         self.due = min((tpdo.sync.due for tpdo in self), default=NEVER)
 
     def held_up(self, now: int) -> None:
-        """The process was held up until ``now``."""
+        """Note that the process was held up until ``now``."""
         self._held_up_ns = now
 
     def repeat(self, now: int) -> None:
-        """Send once more what is sent on change only."""
+        """Send again the PDOs that are sent on changes only."""
         for tpdo in self:
             tpdo.repeat(now)

@@ -1,23 +1,27 @@
-"""The SDO server: one transfer at a time, expedited, segmented or block (``sdo_transfers``), by CiA 301 v4.2 clause 7.2.4.
+"""The SDO server: one transfer at a time (CiA 301 v4.2, clause 7.2.4).
 
-Request frames and time in, answer frames out through ``send``; the object dictionary says what is there. Byte 0 of a
-request holds the client command specifier in its three highest bits; index, sub-index and all numbers are little endian.
+Expedited transfers are served here, transfers of several requests in ``sdo_transfers``. Byte 0 of a
+request holds the client command specifier in its three highest bits. Index, sub-index and all
+numbers are little endian.
 
-Choices where the standard leaves room:
+The standard leaves room for these choices:
 
-* A request whose length is not 8 is ignored without an answer: every SDO frame has 8 bytes (7.2.4.3), so it is none, and what it
-  lacks could be the very bytes that an answer would have to name.
-* An initiate request in the midst of a transfer starts the new one and drops the old one without an abort: the client has
-  evidently given it up (it was restarted, say), and an abort would be taken for the answer to its new request.
-* Within a sub-block of a block download every frame is a segment, except 80h, which no segment can begin with: 40h is segment 64
-  there. When such a sub-block is cut short by us, the segments that the client had already sent are swallowed as long as they
-  follow one another in number and time; taken as requests they could write to any object.
-* More data than the indicated size or than the object holds ends in 06070012h as soon as it is certain, less than the indicated
-  size in 06070013h after the last segment. 06070010h ("does not match") is left to the dictionary: here it is always known in
-  which way the length is wrong.
-* Both answers to a block initiate say that the server supports a CRC, whatever the client does; there is one only if the client
-  supports it too. Without, the field is 0 in a block upload and not looked at in a block download.
-* An unused bit ("x") of a command is ignored, so any command with specifier 4 is an abort; an abort is never answered.
+* A request whose length is not 8 is ignored without an answer. Every SDO frame has 8 bytes
+  (7.2.4.3), and the missing bytes could be the ones that an answer would have to repeat.
+* An initiate request during a transfer starts the new one and drops the old one without an abort.
+  The client has evidently given it up, for example because it was restarted, and would take an
+  abort for the answer to its new request.
+* Within a sub-block of a block download every frame is a segment, except 80h, with which a segment
+  cannot begin: 40h is segment 64 there. If the server ends such a sub-block early, it ignores the
+  segments that the client had already sent, while their numbers are consecutive and their distance
+  in time is short. As requests they could write to any object.
+* More data than the indicated size, or than the object can hold, ends in 06070012h as soon as it is
+  certain. Less than the indicated size ends in 06070013h after the last segment. 06070010h ("does
+  not match") is not used here, because it is always known whether data is too long or too short.
+* Both answers to a block initiate report that the server supports a CRC. A CRC is used only if the
+  client supports it too. Otherwise the field is 0 in a block upload and ignored in a block download.
+* An unused bit ("x") of a command is ignored, so any command with specifier 4 is an abort. An abort
+  is never answered.
 """
 
 from collections import deque
@@ -50,10 +54,10 @@ _NO_MULTIPLEXER = b"\0\0\0"
 
 
 class SdoServer:
-    """One SDO server. ``send`` is called with the 8 bytes of each answer.
+    """The SDO server of one node. ``send`` is called with the 8 bytes of each answer.
 
-    ``segment_ns``: distance that block upload segments keep on average, in bursts of up to four, driven by ``advance``; 0: a whole
-    sub-block at once. No input raises.
+    ``segment_ns`` is the average distance of block upload segments, which ``advance`` sends in
+    bursts of up to four. With 0 a whole sub-block is sent at once. No input raises.
     """
 
     def __init__(
@@ -64,15 +68,19 @@ class SdoServer:
         self._segment_ns = segment_ns
         self._transfer: Transfer | None = None
         self._confirming = False
-        """All data is here, the result of the dictionary is pending."""
+        """All data has arrived, and the dictionary's result is pending."""
         self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER
-        self._answer = b""  # what confirms a download
+        self._confirmation = b""
+        """The answer that confirms the download."""
         self._ticket = 0
         self._outgoing: deque[bytes] = deque()
         """Segments of a block upload's sub-block."""
         self._next_burst = 0
-        """When more of them may be sent; of all uploads: one that begins anew has not more of the bus."""
+        """Earliest time of the next burst.
+
+        A new upload does not reset it, so that restarted uploads get no more of the bus.
+        """
         self._sub_block = SubBlock()
 
     @property
@@ -82,11 +90,11 @@ class SdoServer:
 
     @property
     def waiting(self) -> int | None:
-        """The ticket of the download that waits for ``confirm``, different for each; None: none waits."""
+        """The ticket of the download that waits for ``confirm``, or None. Each has another."""
         return self._ticket if self._confirming else None
 
     def receive(self, data: bytes, now: int) -> None:
-        """The data of one request frame, of any length."""
+        """Serve the data of one request frame. Other lengths than 8 bytes are ignored."""
         if len(data) != 8:
             return
         if now >= self._deadline:
@@ -94,8 +102,8 @@ class SdoServer:
         is_segment = self._sub_block.next_segment is not None and data[0] != _CLIENT_ABORT
         try:
             if is_segment:
-                self._sub_block.seen(now)
-                self._go_on(data, now)
+                self._sub_block.note_segment(now)
+                self._continue(data, now)
             elif not self._sub_block.swallow(data[0], now):
                 self._serve(data, now)
         except SdoAbort as abort:
@@ -106,22 +114,26 @@ class SdoServer:
             self._deadline = now + TIMEOUT_NS
 
     def confirm(self, code: Abort | None, ticket: int | None = None) -> None:
-        """The result of a download that returned False: ``code`` is why it failed, None that it is done.
+        """Answer a download for which the dictionary returned False.
 
-        Ignored if the transfer is no longer waiting. A caller that can have several results under way passes the ``ticket`` that
-        ``waiting`` gave, so that the result of a dropped transfer does not confirm the one after it.
+        ``code`` is the reason of its failure, or None if it succeeded. The call is ignored if the
+        transfer is no longer waiting. A caller that can have several results under way passes the
+        ``ticket`` that ``waiting`` returned, so that the result of a dropped transfer does not
+        confirm the next one.
         """
-        if not self._confirming or (ticket is not None and ticket != self._ticket):
+        if not self._confirming:
+            return
+        if ticket is not None and ticket != self._ticket:
             return
         if code is not None:
             self._abort(code)
             return
-        answer = self._answer
+        confirmation = self._confirmation
         self.reset()
-        self._send(answer)
+        self._send(confirmation)
 
     def advance(self, now: int) -> None:
-        """Let time pass: the time-out of a transfer, and the paced segments of a block upload."""
+        """Send paced segments of a block upload that are due, or end a transfer that timed out."""
         if now < self.due:
             return
         if self._outgoing:
@@ -132,12 +144,13 @@ class SdoServer:
 
     @property
     def due(self) -> int:
-        """When ``advance`` has something to do."""
+        """Earliest time at which ``advance`` acts. NEVER if there is no transfer."""
         return self._next_burst if self._outgoing else self._deadline
 
     def reset(self) -> None:
         """Drop any transfer without an answer."""
-        self._transfer, self._confirming = None, False
+        self._transfer = None
+        self._confirming = False
         self._sub_block.close()
         self._outgoing.clear()
         self._deadline = NEVER
@@ -151,116 +164,142 @@ class SdoServer:
             case 1:
                 self._initiate_download(data, now)
             case 2:
-                self._start_upload(self._upload(data, now))
+                self._begin(data)
+                self._start_upload(self._read_value(now))
             case 4:
                 self.reset()
                 self._sub_block.forget()
             case 5 if not command & 3:
                 self._initiate_block_upload(data, now)
             case 6 if not command & 1:
-                # 110x xCs0 (C: CRC), multiplexer, size. Answer: A4h (CRC supported), multiplexer, block size, 0 (3)
-                sizes = self._check_download(data, bool(command & 2))
-                self._sub_block.seen(now)
-                answer = self._initiated(0xA4, bytes((BLOCK_SIZE,)))
-                self._start(block_download(answer, *sizes, bool(command & 4), self._sub_block))
+                self._initiate_block_download(data, now)
             case _:
-                self._go_on(data, now)
+                self._continue(data, now)
 
     def _start(self, transfer: Transfer) -> None:
         self._transfer = transfer
         self._send(next(transfer))
 
-    def _go_on(self, data: bytes, now: int) -> None:
-        """A request that belongs to the present transfer; 05040001h where there is none."""
+    def _continue(self, data: bytes, now: int) -> None:
+        """Pass a request to the present transfer. SdoAbort 05040001h if there is none."""
         if self._transfer is None:
             raise SdoAbort(Abort.COMMAND)
         try:
             answer = self._transfer.send(data)
         except StopIteration as end:
-            whole, answer = end.value
-            if whole is not None:
-                self._store(whole, answer, now)
+            downloaded, answer = end.value
+            if downloaded is not None:
+                self._store(downloaded, answer, now)
                 return
             self.reset()
         if answer:
             self._send(answer)
         self._send_burst(now)
 
-    def _begin(self, data: bytes) -> tuple[int, int]:
-        """Leave what is going on for the transfer that an initiate request names: index and sub-index."""
+    def _begin(self, data: bytes) -> None:
+        """Drop any transfer, and take the multiplexer of an initiate request."""
         self.reset()
         self._multiplexer = data[1:4]
-        return self._place
 
     @property
-    def _place(self) -> tuple[int, int]:
-        return int.from_bytes(self._multiplexer[:2], "little"), self._multiplexer[2]
+    def _index(self) -> int:
+        return int.from_bytes(self._multiplexer[:2], "little")
+
+    @property
+    def _sub(self) -> int:
+        return self._multiplexer[2]
 
     def _initiated(self, command: int, data: bytes = b"") -> bytes:
-        """An answer with the multiplexer of the present transfer."""
+        """Return an answer with the multiplexer of the present transfer."""
         return bytes((command,)) + self._multiplexer + data.ljust(4, b"\0")
 
     def _abort(self, code: Abort) -> None:
-        """80h, multiplexer of the present transfer or 0, code."""
+        """Send 80h, the multiplexer of the present transfer (0 without one) and the code."""
         answer = self._initiated(0x80, code.to_bytes(4, "little"))
         self.reset()
         self._send(answer)
 
     # ---- download
 
-    def _check_download(self, data: bytes, indicated: bool) -> tuple[int | None, int]:
-        """Begin a download of several segments: the size that the client indicates, and how many bytes there can be."""
-        size = int.from_bytes(data[4:8], "little") if indicated else None
-        limit = self._objects.check_download(*self._begin(data), size)
-        return size, limit if size is None else size
+    def _check_download(self, data: bytes, is_size_indicated: bool) -> tuple[int | None, int]:
+        """Begin a download of several segments.
+
+        Returns the size that the client indicates, or None, and the maximum number of bytes.
+        """
+        size = int.from_bytes(data[4:8], "little") if is_size_indicated else None
+        self._begin(data)
+        limit = self._objects.check_download(self._index, self._sub, size)
+        if size is None:
+            return None, limit
+        return size, size
 
     def _initiate_download(self, data: bytes, now: int) -> None:
-        """001n nnes, multiplexer, data or size. Answer: 60h, multiplexer, 0 (4)."""
+        """Serve 001n nnes, multiplexer, data or size. Answer: 60h, multiplexer, 0 (4)."""
         command = data[0]
-        if not command & 2:
-            sizes = self._check_download(data, bool(command & 1))
-            self._start(segmented_download(self._initiated(0x60), *sizes))
+        is_expedited = bool(command & 2)
+        is_size_indicated = bool(command & 1)
+        if not is_expedited:
+            size, limit = self._check_download(data, is_size_indicated)
+            answer = self._initiated(0x60)
+            self._start(segmented_download(answer, size, limit))
             return
-        size = 4 - (command >> 2 & 3) if command & 1 else None
-        limit = self._objects.check_download(*self._begin(data), size)
-        # without a size the object's own length counts (e = 1, s = 0: "unspecified number of bytes")
-        value = data[4 : 4 + (min(4, limit) if size is None else size)]
-        self._store(value, self._initiated(0x60), now)
+        size = 4 - (command >> 2 & 3) if is_size_indicated else None
+        self._begin(data)
+        limit = self._objects.check_download(self._index, self._sub, size)
+        if size is None:
+            # "unspecified number of bytes" (e = 1, s = 0): the object's own length counts
+            size = min(4, limit)
+        self._store(data[4 : 4 + size], self._initiated(0x60), now)
+
+    def _initiate_block_download(self, data: bytes, now: int) -> None:
+        """Serve 110x xCs0 (C: CRC, s: size indicated), multiplexer, size.
+
+        Answer: A4h (CRC supported), multiplexer, block size, 0 (3).
+        """
+        is_size_indicated = bool(data[0] & 2)
+        with_crc = bool(data[0] & 4)
+        size, limit = self._check_download(data, is_size_indicated)
+        self._sub_block.note_segment(now)
+        answer = self._initiated(0xA4, bytes((BLOCK_SIZE,)))
+        self._start(block_download(answer, size, limit, with_crc, self._sub_block))
 
     def _store(self, data: bytes, answer: bytes, now: int) -> None:
-        """Hand all data to the dictionary; ``answer`` confirms it."""
-        # waiting before the dictionary is asked, so that it may confirm or reset from within the call
-        self._transfer, self._confirming = None, True
+        """Pass all data to the dictionary. ``answer`` confirms the download."""
+        # set before the call, because the dictionary may confirm or reset from within it
+        self._transfer = None
+        self._confirming = True
         self._ticket += 1
-        self._answer = answer
+        self._confirmation = answer
         ticket = self._ticket
-        if self._objects.download(*self._place, data, now):
+        if self._objects.download(self._index, self._sub, data, now):
             self.confirm(None, ticket)
 
     # ---- upload
 
-    def _upload(self, data: bytes, now: int) -> bytes:
-        """Begin an upload: the value."""
-        return self._objects.upload(*self._begin(data), now)
+    def _read_value(self, now: int) -> bytes:
+        return self._objects.upload(self._index, self._sub, now)
 
     def _start_upload(self, data: bytes) -> None:
-        """Request 010x xxxx, multiplexer, 0 (4). Answer: 0100 nnes, multiplexer, data or size."""
+        """Serve 010x xxxx, multiplexer, 0 (4). Answer: 0100 nnes, multiplexer, data or size."""
         if 1 <= len(data) <= 4:
-            self._send(self._initiated(0x43 | (4 - len(data)) << 2, data))
+            unused = 4 - len(data)
+            self._send(self._initiated(0x43 | unused << 2, data))
             self.reset()
         else:
             answer = self._initiated(0x41, len(data).to_bytes(4, "little"))
             self._start(segmented_upload(answer, data))
 
     def _initiate_block_upload(self, data: bytes, now: int) -> None:
-        """101x xC00 (C: CRC), multiplexer, block size, threshold, 0 (2). Answer: C6h (CRC, size), multiplexer, size.
+        """Serve 101x xC00 (C: CRC), multiplexer, block size, threshold, 0 (2).
 
-        With a threshold other than 0 a value of at most that many bytes goes by expedited or segmented upload instead.
+        Answer: C6h (CRC, size), multiplexer, size. With a threshold other than 0, a value of at
+        most that many bytes is sent by an expedited or segmented upload instead.
         """
         self._begin(data)
-        block_size, threshold = data[4], data[5]
+        block_size = data[4]
+        threshold = data[5]
         check_block_size(block_size)
-        value = self._upload(data, now)
+        value = self._read_value(now)
         if threshold and len(value) <= threshold:
             self._start_upload(value)
         else:
@@ -269,7 +308,7 @@ class SdoServer:
             self._start(block_upload(answer, value, block_size, with_crc, self._outgoing))
 
     def _send_burst(self, now: int) -> None:
-        """Send of a sub-block what its time has come for."""
+        """Send the segments of a sub-block that are due."""
         if not self._outgoing or now < self._next_burst:
             return
         count = len(self._outgoing)

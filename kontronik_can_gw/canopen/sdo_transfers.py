@@ -1,7 +1,8 @@
-"""SDO transfers of several requests (CiA 301, 7.2.4.2.3 to 7.2.4.2.16), each a generator; refusals are ``SdoAbort``.
+"""SDO transfers of several requests, each a generator (CiA 301, 7.2.4.2.3 to 7.2.4.2.16).
 
-It yields the answer to each request and is sent the next one. What it returns: the data of a download, None after an upload, and the
-last answer.
+A generator yields the answer to each request and is sent the next request. A refusal is raised as
+``SdoAbort``. The generator returns the last answer, and before it the data of a download, or None
+after an upload.
 """
 
 from binascii import crc_hqx
@@ -11,60 +12,69 @@ from collections.abc import Generator
 from kontronik_can_gw.canopen.dictionary import Abort, SdoAbort
 
 BLOCK_SIZE = 127
-"""Segments of one sub-block of a block download, the most there can be."""
+"""Segments of one sub-block of a block download: the maximum of the standard."""
 IN_FLIGHT_NS = 50_000_000
-"""Segments sent before the client saw our abort follow one another more closely than this."""
+"""Maximum distance of segments that the client sent before it saw the server's abort."""
 Transfer = Generator[bytes, bytes, tuple[bytes | None, bytes]]
 
+_SEGMENT_BYTES = 7
 _TOGGLE = 0x10
 _LAST_SEGMENT = 0x80
 
 
 class SubBlock:
-    """The sub-block of a block download that is open, and segments in flight: sent before the client saw that one was cut short."""
+    """The open sub-block of a block download, and the segments in flight after it was ended early.
+
+    Segments in flight were sent before the client saw the server's abort.
+    """
 
     def __init__(self) -> None:
         self.next_segment: int | None = None
-        """Number of the segment that follows, 0: none; None: no sub-block is open."""
+        """Number of the next segment, 0 after the last one. None if no sub-block is open."""
         self.is_in_sequence = True
-        """False if the last segment was not the one that had to follow."""
-        self._in_flight = 0  # number of the next one, 0: none
+        """False if the last segment did not have the next number."""
+        self._in_flight = 0
+        """Number of the next segment in flight. 0 if no more are expected."""
         self._until = 0
 
-    def seen(self, now: int) -> None:
-        """Notes the time of a segment of the open sub-block."""
+    def note_segment(self, now: int) -> None:
+        """Note the time of a segment of the open sub-block."""
         self._until = now + IN_FLIGHT_NS
 
     def close(self) -> None:
-        """The transfer is over."""
+        """End the sub-block because its transfer has ended."""
         if self.next_segment is not None:
-            self._in_flight, self.next_segment = self.next_segment, None
+            self._in_flight = self.next_segment
+            self.next_segment = None
 
     def forget(self) -> None:
-        """The client sends no more segments."""
+        """Expect no more segments in flight."""
         self._in_flight = 0
 
     def swallow(self, command: int, now: int) -> bool:
-        """True for a segment in flight."""
+        """Return True for a segment in flight, which must be ignored."""
         if not self._in_flight:
             return False
         if command & 0x7F != self._in_flight or now > self._until:
             self._in_flight = 0
             return False
-        done = command & _LAST_SEGMENT or self._in_flight == BLOCK_SIZE
-        self._in_flight = 0 if done else self._in_flight + 1
+        is_last = command & _LAST_SEGMENT or self._in_flight == BLOCK_SIZE
+        self._in_flight = 0 if is_last else self._in_flight + 1
         self._until = now + IN_FLIGHT_NS
         return True
 
 
 def segmented_download(answer: bytes, size: int | None, limit: int) -> Transfer:
-    """Segments: 000t nnnc, data (7). Answers: 001t 0000, 0 (7)."""
-    data, toggle, command = bytearray(), 0, 0
+    """Receive segments: 000t nnnc, data (7). Answers: 001t 0000, 0 (7)."""
+    data = bytearray()
+    toggle = 0
+    command = 0
     while not command & 1:
         request = yield answer
         command = request[0]
         _check_segment(command, 0, toggle)
-        data += request[1 : 8 - (command >> 1 & 7)]
+        unused = command >> 1 & 7
+        data += request[1 : 8 - unused]
         _check_limit(data, limit)
         answer = bytes((0x20 | toggle, 0, 0, 0, 0, 0, 0, 0))
         toggle ^= _TOGGLE
@@ -73,14 +83,17 @@ def segmented_download(answer: bytes, size: int | None, limit: int) -> Transfer:
 
 
 def segmented_upload(answer: bytes, data: bytes) -> Transfer:
-    """Requests: 011t xxxx, 0 (7). Answers: 000t nnnc, data (7)."""
+    """Send segments. Requests: 011t xxxx, 0 (7). Answers: 000t nnnc, data (7)."""
     toggle = 0
-    for at in range(0, max(1, len(data)), 7):
+    for start in range(0, max(1, len(data)), _SEGMENT_BYTES):
         request = yield answer
         _check_segment(request[0], 3, toggle)
-        segment = data[at : at + 7]
-        head = toggle | (7 - len(segment)) << 1 | (at + 7 >= len(data))
-        answer = bytes((head,)) + segment.ljust(7, b"\0")
+        end = start + _SEGMENT_BYTES
+        segment = data[start:end]
+        unused = _SEGMENT_BYTES - len(segment)
+        is_last = end >= len(data)
+        head = toggle | unused << 1 | is_last
+        answer = bytes((head,)) + segment.ljust(_SEGMENT_BYTES, b"\0")
         toggle ^= _TOGGLE
     return None, answer
 
@@ -88,16 +101,21 @@ def segmented_upload(answer: bytes, data: bytes) -> Transfer:
 def block_download(
     answer: bytes, size: int | None, limit: int, with_crc: bool, sub_block: SubBlock
 ) -> Transfer:
-    """Only segments in sequence are taken; the client repeats what follows the last accepted one.
+    """Receive segments in sequence. The client repeats all after the last accepted one.
 
-    Segments: cnnn nnnn (c: last, n: number), data (7). Answer after the last one of a sub-block: A2h, accepted, block size, 0 (5).
-    End: 110n nnx1 (n: bytes of the last segment that are none), CRC (2), 0 (5). Answer: A1h, 0 (7).
+    Segments: cnnn nnnn (c: last, n: number), data (7). Answer after the last segment of a
+    sub-block: A2h, accepted, block size, 0 (5). End: 110n nnx1 (n: unused bytes of the last
+    segment), CRC (2), 0 (5). Answer: A1h, 0 (7).
     """
-    data, accepted, complete = bytearray(), 0, False
+    data = bytearray()
+    accepted = 0
+    is_complete = False
     sub_block.next_segment = 1
-    while not complete:
+    while not is_complete:
         request = yield answer
-        number, last, answer = request[0] & 0x7F, request[0] & _LAST_SEGMENT, b""
+        number = request[0] & 0x7F
+        is_last = bool(request[0] & _LAST_SEGMENT)
+        answer = b""
         sub_block.next_segment = number + 1 if number < BLOCK_SIZE else 0
         if not number:
             raise SdoAbort(Abort.SEQUENCE)
@@ -105,19 +123,21 @@ def block_download(
         if sub_block.is_in_sequence:
             accepted = number
             data += request[1:]
-            if not last:  # how many bytes of the last segment count is in the end request
+            if not is_last:  # the end request holds the number of unused bytes of the last one
                 _check_limit(data, limit)
-        if last or number == BLOCK_SIZE:
+        if is_last or number == BLOCK_SIZE:
             answer = bytes((0xA2, accepted, BLOCK_SIZE, 0, 0, 0, 0, 0))
-            accepted, sub_block.next_segment = 0, 1
-            complete = bool(last) and sub_block.is_in_sequence
+            accepted = 0
+            sub_block.next_segment = 1
+            is_complete = is_last and sub_block.is_in_sequence
     sub_block.next_segment = None
     request = yield answer
     if request[0] & 0xE1 != 0xC1:
         raise SdoAbort(Abort.COMMAND)
-    del data[len(data) - (request[0] >> 2 & 7) :]
+    unused = request[0] >> 2 & 7
+    del data[len(data) - unused :]
     _check_limit(data, limit)
-    _check_size(data, size)  # before the CRC, which over a wrong length is wrong anyway
+    _check_size(data, size)  # before the CRC, which is always wrong over a wrong length
     if with_crc and crc_hqx(data, 0) != int.from_bytes(request[1:3], "little"):
         raise SdoAbort(Abort.CRC)
     return bytes(data), b"\xa1" + bytes(7)
@@ -126,38 +146,51 @@ def block_download(
 def block_upload(
     answer: bytes, data: bytes, block_size: int, with_crc: bool, outgoing: deque[bytes]
 ) -> Transfer:
-    """A sub-block at a time is put into ``outgoing``. A3h starts; A2h, last segment received, next block size goes on; A1h ends.
+    """Send a sub-block at a time by putting it into ``outgoing``.
 
-    A2h may come before the sub-block is out, when the client saw a gap. End frame: 110n nn01 (n: bytes of the last segment that are
-    none), CRC (2), 0 (5).
+    A3h starts the upload. A2h, last segment received, next block size continues it. A1h ends it.
+    A2h may arrive before the whole sub-block was sent, if the client saw a gap. End frame: 110n
+    nn01 (n: unused bytes of the last segment), CRC (2), 0 (5).
     """
-    # no bytes still need one segment to say that it is the last
-    count, confirmed = max(1, -(-len(data) // 7)), 0
-    _check_block_command((yield answer), 3)
+    # even without data, one segment is needed to mark the end
+    count = max(1, -(-len(data) // _SEGMENT_BYTES))
+    confirmed = 0
+    request = yield answer
+    _check_block_command(request, 3)
     while confirmed < count:
-        numbers = range(1, min(block_size, count - confirmed) + 1)
-        for number in numbers:
-            at = confirmed + number
-            last = _LAST_SEGMENT if at == count else 0
-            segment = data[7 * at - 7 : 7 * at].ljust(7, b"\0")
-            outgoing.append(bytes((last | number,)) + segment)
+        in_sub_block = min(block_size, count - confirmed)
+        outgoing += _segments(data, confirmed, in_sub_block, count)
         request = yield b""
         _check_block_command(request, 2)
-        if request[1] > len(numbers) - len(outgoing):
+        received = request[1]
+        if received > in_sub_block - len(outgoing):
             raise SdoAbort(Abort.SEQUENCE)
         block_size = request[2]
-        # also after the last segment, where no block follows: the field is bound to 1..127 without exception
+        # also after the last segment: the standard limits the field to 1..127 without exception
         check_block_size(block_size)
-        confirmed += request[1]
+        confirmed += received
         outgoing.clear()
     crc = crc_hqx(data, 0) if with_crc else 0
-    head = 0xC1 | 7 * count - len(data) << 2
-    _check_block_command((yield bytes((head,)) + crc.to_bytes(2, "little") + bytes(5)), 1)
+    unused = _SEGMENT_BYTES * count - len(data)
+    head = 0xC1 | unused << 2
+    request = yield bytes((head,)) + crc.to_bytes(2, "little") + bytes(5)
+    _check_block_command(request, 1)
     return None, b""
 
 
+def _segments(data: bytes, confirmed: int, in_sub_block: int, count: int) -> list[bytes]:
+    """Return the segments of a sub-block that begins after ``confirmed`` of ``count`` segments."""
+    segments = []
+    for number in range(1, in_sub_block + 1):
+        end = _SEGMENT_BYTES * (confirmed + number)
+        last = _LAST_SEGMENT if confirmed + number == count else 0
+        content = data[end - _SEGMENT_BYTES : end].ljust(_SEGMENT_BYTES, b"\0")
+        segments.append(bytes((last | number,)) + content)
+    return segments
+
+
 def check_block_size(block_size: int) -> None:
-    """1..127, else 05040002h."""
+    """SdoAbort 05040002h unless the block size is 1..127."""
     if not 1 <= block_size <= 127:
         raise SdoAbort(Abort.BLOCK_SIZE)
 

@@ -1,4 +1,7 @@
-"""SYNC, consumer side: the SYNC of a node, and when its TPDOs of types 0 to 240 are sent (CiA 301, 7.2.5)."""
+"""The consumer of SYNC: the SYNC that a node follows, and its TPDOs of types 0 to 240.
+
+See CiA 301, 7.2.5.
+"""
 
 from kontronik_can_gw.canopen.cob_ids import SYNC, Taken, check_free
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
@@ -7,13 +10,16 @@ from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import NEVER
 
 MAX_WAITING = 32
-"""At most this many frames of one TPDO wait for their turn after SYNCs that were read at once."""
+"""Maximum number of frames of one TPDO that wait after several SYNCs were read at once."""
 LAST_SYNC_TYPE = 240
-_FRAME_BIT, _PRODUCER_BIT = 1 << 29, 1 << 30
+_FRAME_BIT = 1 << 29
+_PRODUCER_BIT = 1 << 30
 
 
 class SyncTransmission:
-    """Counts SYNCs for one TPDO and sends it. ``status`` counts the PDOs that a newer one replaced.
+    """Counts SYNCs for one TPDO, and sends it.
+
+    ``status`` counts the PDOs that a newer one replaced.
 
     Several SYNCs may be read in one turn of the loop, after a delay. With type 1 the newest PDO
     replaces the earlier ones of that turn. With types 2 to 240 every PDO is sent, one for each call
@@ -22,7 +28,7 @@ class SyncTransmission:
 
     def __init__(self, slot: Slot, status: GatewayStatus) -> None:
         self.due = NEVER
-        """When ``advance`` has something to do."""
+        """Earliest time at which ``advance`` acts."""
         self._slot = slot
         self._status = status
         self._type = 0
@@ -32,25 +38,25 @@ class SyncTransmission:
         self._waiting = 0
 
     def configure(self, transmission_type: int, start_value: int) -> None:
-        """Takes over 180xh:2 and 180xh:6. The count of SYNCs goes on."""
+        """Take over 180xh:2 and 180xh:6. The count of SYNCs continues."""
         if transmission_type != self._type:
             self.stop()
         self._type = transmission_type
         self._start_value = start_value
 
     def begin(self) -> None:
-        """Starts the count of SYNCs again."""
+        """Start the count of SYNCs again."""
         self.stop()
         self._count = 0
         self._has_begun = self._start_value == 0
 
     def stop(self) -> None:
-        """Discards the PDOs that wait for their turn."""
+        """Discard the PDOs that wait for their turn."""
         self._waiting = 0
         self.due = NEVER
 
     def on_sync(self, counter: int, now: int, answer: bool) -> None:
-        """Counts a SYNC and sends the PDO if it is due.
+        """Count a SYNC, and send the PDO if it is due.
 
         ``counter`` is 0 if the SYNC has none. Without ``answer`` the SYNC is only counted.
         """
@@ -71,7 +77,7 @@ class SyncTransmission:
                 self._send(now)
 
     def advance(self, now: int) -> None:
-        """Sends one PDO that waits, if the one before it has been handed over."""
+        """Send one waiting PDO if the one before it was handed over."""
         if now < self.due or self._slot.is_pending:
             return
         self._waiting -= 1
@@ -103,16 +109,17 @@ class SyncConsumer:
         return self._dictionary.number(0x1005) & 0x7FF
 
     def counter(self, data: bytes) -> int | None:
-        """Returns the counter of a SYNC, or 0 if 1019h sets none. Returns None for a wrong length.
+        """Return the counter of a SYNC, or 0 if 1019h sets none. None for a wrong length.
 
         A SYNC has one byte of data if 1019h sets a counter, and no data otherwise.
         """
-        if len(data) != (1 if self._dictionary.number(0x1019) else 0):
+        has_counter = self._dictionary.number(0x1019) != 0
+        if len(data) != int(has_counter):
             return None
-        return data[0] if data else 0
+        return data[0] if has_counter else 0
 
     def _check_cob_id(self, value: int) -> None:
-        """Checks a new 1005h.
+        """Check a new 1005h.
 
         SdoAbort 06090030h for a SYNC producer, 29-bit ids, reserved bits and restricted ids.
         """
@@ -122,6 +129,6 @@ class SyncConsumer:
 
 
 def _check_overflow(value: int) -> None:
-    """Checks a new 1019h: 0 (no counter) or 2 to 240, otherwise SdoAbort 06090030h."""
+    """SdoAbort 06090030h unless a new 1019h is 0 (no counter) or 2 to 240."""
     if value == 1 or value > 240:
         raise SdoAbort(Abort.VALUE)

@@ -1,10 +1,12 @@
-"""The capture file (.kcap): input from the ESCs and the bus, with times. Pure: bytes to entries and back.
+"""The capture file (.kcap): data from the ESCs and the bus, with times. Pure.
 
-A file is a sequence of blocks, each written at once and readable by itself: a loss of power costs only the last block, damage only the
-blocks that it hits. All numbers are little-endian. A block::
+A file is a sequence of blocks. Each block is written at once and can be read without the others: a
+loss of power destroys only the last block, and damage destroys only the blocks that it hits. All
+numbers are little-endian. A block::
 
     4 bytes  "KCB1"
-    u8       kind: "H" header (JSON), "I" information (JSON, adds to the header), "D" data, "E" end (empty: closed in good order)
+    u8       kind: "H" header (JSON), "I" information (JSON, adds to the header), "D" data,
+             "E" end (empty: the file was closed properly)
     u8       1: the payload is deflated (zlib)
     u16      0
     u32      length of the payload as stored
@@ -13,18 +15,19 @@ blocks that it hits. All numbers are little-endian. A block::
     u32      CRC-32 (zlib) of the 20 bytes above and the payload as stored
     payload
 
-A file begins with a header block, which is repeated after the first data in case the first is damaged. The payload of a data block is a
-table, followed by the data of its entries::
+A file begins with a header block. It is repeated after the first data in case the first one is
+damaged. The payload of a data block is a table, followed by the data of its entries::
 
     u32      number of entries
-    entries  16 bytes each: u64 time in ns of the recording machine's monotonic clock, u8 kind (``Kind``), u8 flags, u16 index (of the ESC),
-             u32 length of its data
+    entries  16 bytes each: u64 time in ns of the recording machine's monotonic clock,
+             u8 kind (``Kind``), u8 flags, u16 index of the ESC, u32 length of its data
 
-From version 2 on the data of BYTES and FRAME begins with a u64 time on the same clock as the entry's: for BYTES a moment before any of
-the bytes arrived, for FRAME the arrival of the CAN frame. In version 1 it is missing; the entry's own time is used.
+Since version 2 the data of BYTES and FRAME begin with a u64 time on the clock of the entry. For
+BYTES it is a time before any of the bytes arrived, for FRAME the arrival of the CAN frame. Version
+1 does not have it, so the time of the entry is used.
 
-Times do not decrease. The entries are all calls to the gateway's core, in order: replayed, they give every CAN frame that was sent, at
-its time.
+Times do not decrease. The entries are all calls to the gateway's core, in order. Their replay gives
+each CAN frame that was sent, at its time.
 """
 
 import json
@@ -38,67 +41,70 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 
 SUFFIX = ".kcap"
 MAGIC = b"KCB1"
-FORMAT, VERSION = "kontronik-can-gw capture", 2
+FORMAT = "kontronik-can-gw capture"
+VERSION = 2
 VERSIONS = (1, 2)
 """Versions that can be read."""
 LARGEST_PAYLOAD = 1 << 23
 _PATIENCE = 1 << 28
+"""Budget of bytes that the checks of false blocks may cost. Each check adds 64 to it."""
 _HEAD = struct.Struct("<4scBHIII")
 _CRC = struct.Struct("<I")
 HEAD_LENGTH = _HEAD.size + _CRC.size
 _ENTRY = struct.Struct("<QBBHI")
 _COUNT = struct.Struct("<I")
 _FRAME = struct.Struct("<IB")
-_FD, _REMOTE = 1, 2
+_FD = 1
+_REMOTE = 2
 _NUMBER = struct.Struct("<Q")
 
 
 class Kind(IntEnum):
-    """Kinds of entries; the data of each in brackets."""
+    """Kinds of entries. The data of an entry is described in brackets."""
 
     BYTES = 1
     """Bytes read from an ESC's UART."""
     FRAME = 2
     """A CAN frame that the gateway received (``frame_data``)."""
     ADVANCE = 3
-    """The time advanced; then the frames to send were taken."""
+    """The time advanced. Then the frames to send were taken."""
     START = 4
-    """The gateway started; flags 1: the interface was open."""
+    """The gateway started. flags 1: the interface was open."""
     STOP = 5
     PORT_OPENED = 6
     PORT_LOST = 7
     CAN_OPENED = 8
     CAN_RETURNED = 9
     CAN_STATE = 10
-    """flags: the state (``sources.CanState``)."""
+    """flags: the state (``status.CanState``)."""
     OVERRUN = 11
     SAVED = 12
-    """Parameters were stored; flags 1: storing failed (UTF-8: why)."""
+    """Parameters were stored. flags 1: storing failed (the reason in UTF-8)."""
     DAMAGED = 13
     COUNTERS = 14
-    """The gateway's own counters were changed from outside (``COUNTERS``)."""
+    """The runtime changed the gateway's counters (``COUNTERS``)."""
     LINE_ERRORS = 15
-    """Total line errors of an ESC's port (u64)."""
+    """The total number of line errors of an ESC's port (u64)."""
     CLOCK = 16
     """The wall clock at this time: Unix time in ns (u64)."""
     LOST = 17
     """Number of entries that could not be recorded here (u64)."""
     NOT_SENT = 18
-    """The frames taken last were discarded: the interface was down or bus-off."""
+    """The frames taken last were discarded, because the interface was down or bus-off."""
     STATE = 19
-    """JSON: state that a replay needs to begin here (energy, run time and losses of the ESCs, state of the bus)."""
+    """The state with which a replay can begin here (JSON).
+
+    It has energy, run time and losses of the ESCs, and the state of the bus.
+    """
     HELD_UP = 20
-    """The process was delayed; flags 1: pending measurements were dropped."""
+    """The process was delayed. flags 1: pending measurements were dropped."""
 
 
 _WITH_ARRIVAL = frozenset({Kind.BYTES, Kind.FRAME})
 
 
 class Entry(NamedTuple):
-    """One entry. Times: the recording machine's monotonic clock.
-
-    ``came_ns``: for BYTES a moment before any of them arrived, for FRAME its arrival; None where not known: ``time_ns`` is used.
-    """
+    """One entry. Its times are on the recording machine's monotonic clock."""
 
     time_ns: int
     kind: int
@@ -106,31 +112,39 @@ class Entry(NamedTuple):
     data: bytes = b""
     flags: int = 0
     came_ns: int | None = None
+    """For BYTES a time before any of them arrived, for FRAME its arrival.
+
+    If it is None, ``time_ns`` is used.
+    """
 
 
 class Block(NamedTuple):
-    """A block whose CRC is right; ``payload`` inflated. ``offset``: where it begins in the file."""
+    """A block whose CRC is correct."""
 
     kind: bytes
     number: int
     payload: bytes
+    """The inflated payload."""
     offset: int
+    """Position of the block in the file."""
 
 
 class Damage(NamedTuple):
-    """Bytes that are part of no intact block."""
+    """Bytes that do not belong to an intact block."""
 
     offset: int
     length: int
 
 
 def block(kind: bytes, number: int, payload: bytes) -> bytes:
-    """One block, deflated where that makes it shorter."""
+    """Return one block. It is deflated if that makes it shorter."""
     packed = zlib.compress(payload, 1)
     deflated = len(packed) < len(payload)
     stored = packed if deflated else payload
-    head = _HEAD.pack(MAGIC, kind, deflated, 0, len(stored), len(payload), number & 0xFFFFFFFF)
-    return head + _CRC.pack(zlib.crc32(stored, zlib.crc32(head))) + stored
+    number &= 0xFFFFFFFF
+    head = _HEAD.pack(MAGIC, kind, deflated, 0, len(stored), len(payload), number)
+    crc = zlib.crc32(stored, zlib.crc32(head))
+    return head + _CRC.pack(crc) + stored
 
 
 def json_payload(content: Mapping[str, Any]) -> bytes:
@@ -139,12 +153,15 @@ def json_payload(content: Mapping[str, Any]) -> bytes:
 
 
 def read_json(payload: bytes) -> dict[str, Any]:
-    """Return the content of a header or information block. ValueError, for users, if it is no JSON object."""
+    """Return the content of a header or information block.
+
+    Raises ValueError with a text for users if it is not a JSON object.
+    """
     try:
         content = json.loads(payload.decode("utf-8", "surrogatepass"))
     except RecursionError:
         raise ValueError("is nested too deep") from None
-    except ValueError:  # its text would be Python's
+    except ValueError:  # Python's own text is not for users
         raise ValueError("is no JSON text in UTF-8") from None
     if not isinstance(content, dict):
         raise ValueError("is no JSON object")
@@ -152,7 +169,7 @@ def read_json(payload: bytes) -> dict[str, Any]:
 
 
 def data_payload(entries: Iterable[tuple[int, int, int, bytes, int, int | None]]) -> bytes:
-    """Payload of a data block, from tuples with the fields of ``Entry``."""
+    """Return the payload of a data block, from tuples with the fields of ``Entry``."""
     table = bytearray()
     data = []
     count = 0
@@ -167,7 +184,7 @@ def data_payload(entries: Iterable[tuple[int, int, int, bytes, int, int | None]]
 
 
 def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
-    """The entries of a data block. ValueError where its table and its length disagree."""
+    """Yield the entries of a data block. Raises ValueError if its table and length disagree."""
     if len(payload) < _COUNT.size:
         raise ValueError("has no table")
     count = _COUNT.unpack_from(payload)[0]
@@ -182,7 +199,7 @@ def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
 
 
 def entry_at(payload: bytes, number: int, begin: int) -> Entry:
-    """One entry of an intact data block (of version 2). ``begin``: where its data begin."""
+    """Return one entry of an intact data block (of version 2). ``begin``: position of its data."""
     head = _ENTRY.unpack_from(payload, _COUNT.size + number * _ENTRY.size)
     return _entry(head, payload[begin : begin + head[-1]], VERSION)
 
@@ -193,20 +210,26 @@ def _entry(head: tuple[int, ...], data: bytes, version: int) -> Entry:
     if version > 1 and kind in _WITH_ARRIVAL:
         if len(data) < _NUMBER.size:
             raise ValueError("has an entry without its time of arrival")
-        came_ns, data = _NUMBER.unpack_from(data)[0], data[_NUMBER.size :]
+        (came_ns,) = _NUMBER.unpack_from(data)
+        data = data[_NUMBER.size :]
     return Entry(time_ns, kind, index, data, flags, came_ns)
 
 
 def frame_data(frame: CanFrame) -> bytes:
-    """A CAN frame as the data of an entry: u32 id (bit 31: 29 bits), u8 flags (1 FD, 2 remote), its bytes."""
-    return (
-        _FRAME.pack(frame.key, (_FD if frame.fd else 0) | (_REMOTE if frame.remote else 0))
-        + frame.data
-    )
+    """Return a CAN frame as the data of an entry.
+
+    u32 id (bit 31: 29 bits), u8 flags (1 FD, 2 remote), and the bytes of the frame.
+    """
+    flags = 0
+    if frame.fd:
+        flags |= _FD
+    if frame.remote:
+        flags |= _REMOTE
+    return _FRAME.pack(frame.key, flags) + frame.data
 
 
 def read_frame(data: bytes) -> CanFrame:
-    """The CAN frame of an entry. ValueError where it is too short."""
+    """Return the CAN frame of an entry. Raises ValueError if the data are too short."""
     if len(data) < _FRAME.size:
         raise ValueError("is no CAN frame")
     key, flags = _FRAME.unpack_from(data)
@@ -234,12 +257,12 @@ COUNTERS = (
 
 
 def numbers_data(*numbers: int) -> bytes:
-    """Numbers as the data of an entry; each a u64."""
+    """Return numbers as the data of an entry. Each is a u64; negative numbers become 0."""
     return struct.pack(f"<{len(numbers)}Q", *[max(0, number) for number in numbers])
 
 
 def read_numbers(data: bytes) -> tuple[int, ...]:
-    """ValueError where the length is none of numbers."""
+    """Return the numbers of an entry. Raises ValueError if the length does not fit."""
     count, rest = divmod(len(data), _NUMBER.size)
     if rest:
         raise ValueError("are no numbers")
@@ -247,17 +270,21 @@ def read_numbers(data: bytes) -> tuple[int, ...]:
 
 
 class Scanner:
-    """Finds every intact block in a stream of bytes, whatever is between them. Used like a deframer: ``feed``, then ``flush``."""
+    """Finds all intact blocks in a stream of bytes, with any data between them.
+
+    It is used like a deframer: ``feed``, then ``flush``.
+    """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._offset = 0
         """File offset of the buffer's first byte."""
         self._bad_from: int | None = None
+        """File offset of the damage before the present position. None without damage."""
         self._patience = _PATIENCE
 
     def feed(self, data: bytes) -> list[Block | Damage]:
-        """Take the next bytes; return what is certain now."""
+        """Add the next bytes. Return the blocks and damages that are certain."""
         self._buffer += data
         return self._scan(final=False)
 
@@ -274,8 +301,8 @@ class Scanner:
         while True:
             at = buffer.find(MAGIC)
             if at < 0:
-                keep = 0 if final else next((n for n in (3, 2, 1) if buffer.endswith(MAGIC[:n])), 0)
-                self._skip(len(buffer) - keep)
+                kept = 0 if final else _partial_magic(buffer)
+                self._skip(len(buffer) - kept)
                 return found
             self._skip(at)
             if len(buffer) < HEAD_LENGTH:
@@ -319,8 +346,19 @@ class Scanner:
             self._bad_from = None
 
 
+def _partial_magic(buffer: bytearray) -> int:
+    """Return the number of bytes at the buffer's end with which MAGIC may begin."""
+    for length in (3, 2, 1):
+        if buffer.endswith(MAGIC[:length]):
+            return length
+    return 0
+
+
 def _payload(buffer: bytearray, deflated: int, stored: int, size: int) -> bytes | None:
-    """The inflated payload of the block at the buffer's beginning; None where CRC or length is wrong."""
+    """Return the inflated payload of the block at the buffer's beginning.
+
+    None if the CRC or the length is wrong.
+    """
     payload = bytes(buffer[HEAD_LENGTH : HEAD_LENGTH + stored])
     crc = zlib.crc32(payload, zlib.crc32(buffer[: _HEAD.size]))
     if crc != _CRC.unpack_from(buffer, _HEAD.size)[0]:

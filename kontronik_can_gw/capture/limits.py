@@ -1,4 +1,4 @@
-"""Limits of the numbers in a capture: a damaged or hostile one can hold anything."""
+"""Checks the numbers in a capture. A damaged or hostile capture can contain any number."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,20 +7,20 @@ from kontronik_can_gw.capture.format import COUNTERS
 from kontronik_can_gw.core.header_parts import whole_number
 
 END_OF_TIME = 1 << 61
-"""ns. Later times are not from a gateway; sums of earlier ones stay within 64 bits."""
+"""ns. No gateway has later times. The sums of earlier times fit into 64 bits."""
 MAX_COUNT = 1 << 48
-"""Of a counter, and of mW s: at 1 Mbit/s more than a human life."""
+"""Limit of a counter, and of an energy in mW s. At 1 Mbit/s it takes more than a human life."""
 _MAX_MW_NS = MAX_COUNT * 1_000_000_000
 
 
 def check_time(time_ns: int) -> None:
-    """ValueError for a time that no gateway has."""
+    """Raise ValueError for a time that no gateway has."""
     if not 0 <= time_ns < END_OF_TIME:
         raise ValueError(f"time {time_ns}")
 
 
 def check_counters(counters: Sequence[int]) -> None:
-    """ValueError for numbers that a COUNTERS entry of a gateway cannot hold."""
+    """Raise ValueError for numbers that are impossible in a COUNTERS entry."""
     if len(counters) != len(COUNTERS):
         raise ValueError("has other counters")
     check_time(counters[-1])
@@ -33,7 +33,7 @@ _LIMITS_OF_GATEWAY = {"started_ns": END_OF_TIME - 1, "can_state": 5}
 
 
 def check_state(state: Mapping[str, Any]) -> None:
-    """HeaderError for a state (in a header, or a STATE entry) that no gateway has."""
+    """Raise HeaderError for a state in a header or a STATE entry that no gateway has."""
     for esc in state.get("escs", ()):
         for name, high in _LIMITS_OF_ESC.items():
             whole_number(esc[name], 0, high)

@@ -1,4 +1,7 @@
-"""A gateway whose every call is handed to a recorder: played again in their order they give the same frames (capture/replay.py)."""
+"""A gateway that passes all its calls to a recorder.
+
+A replay of the calls in their order gives the same frames (capture/replay.py).
+"""
 
 from collections.abc import Callable, Iterable
 from operator import attrgetter
@@ -10,21 +13,25 @@ from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.status import CanState, GatewayStatus
 
 Put = Callable[[int, int, int, bytes, int, int | None], None]
-"""(time, kind, ESC's index, data, flags, time of arrival), as the fields of ``capture.Entry``."""
+"""A function with the fields of ``Entry``: time, kind, ESC's index, data, flags, arrival."""
 
 
 _counters_of: Callable[[GatewayStatus], tuple[int, ...]] = attrgetter(*COUNTERS)
 Call = tuple[int, int, int, bytes, int | None]
-"""Time, kind, ESC's index, data, time of arrival."""
+"""Time, kind, ESC's index, data, arrival."""
 
 
 class RecordedGateway(Gateway):
-    """What the runtime changes besides, the counters of ``status`` and line errors, is noticed at the next call."""
+    """A gateway that records its calls.
+
+    The runtime also changes the counters of ``status`` and the line errors. These changes are
+    recorded with the next call.
+    """
 
     is_recorded = True
 
     def __init__(self, put: Put, *args: Any, **more: Any) -> None:
-        """``args``, ``more``: as a Gateway takes them."""
+        """Make a gateway with the arguments ``args`` and ``more``."""
         super().__init__(*args, **more)
         self._put = put
         self._counters = _counters_of(self.status)
@@ -60,7 +67,8 @@ class RecordedGateway(Gateway):
         super().receive_overrun(now)
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
-        self._note(now, Kind.SAVED, esc, (error or "").encode(), flags=int(error is not None))
+        reason = (error or "").encode()
+        self._note(now, Kind.SAVED, esc, reason, flags=int(error is not None))
         super().saved(esc, error, now)
 
     def parameters_damaged(self, esc: int, now: int) -> None:
@@ -80,14 +88,14 @@ class RecordedGateway(Gateway):
         super().set_can_state(state, now)
 
     def advance(self, now: int, with_core: bool = True) -> None:
-        if with_core:  # otherwise the core's own was recorded
+        if with_core:  # otherwise the core's own call was recorded
             self._note_line_errors(now)
             self._note(now, Kind.ADVANCE)
         super().advance(now, with_core)
 
     def take_frames(self, now: int) -> list[CanFrame]:
         frames = super().take_frames(now)
-        # as a rule all of them are sent: only what comes otherwise is recorded
+        # usually all of them are sent, so only other changes of the counter are recorded
         self._counters = (self._counters[0] + len(frames), *self._counters[1:])
         return frames
 
@@ -95,12 +103,12 @@ class RecordedGateway(Gateway):
         self._put(now, Kind.NOT_SENT, 0, b"", 0, None)
 
     def prepare_turns(self, now: int) -> None:
-        """The core is about to be called by turns in C: note what holds by then."""
+        """Record counters and line errors before turns in C call the core."""
         self._note_line_errors(now)
         self._note_counters(now)
 
     def turned(self, calls: Iterable[Call], frames: int) -> None:
-        """The core was called by turns in C, and as many frames were taken."""
+        """Record the calls of the core by turns in C. ``frames``: number of frames taken."""
         self._counters = (self._counters[0] + frames, *self._counters[1:])
         for now, kind, esc, data, came in calls:
             self._put(now, kind, esc, data, 0, came)
@@ -131,11 +139,11 @@ class RecordedGateway(Gateway):
 
 
 def state_of(gateway: Gateway) -> dict[str, Any]:
-    """What a replay that begins now cannot know."""
+    """Return the state with which a replay can begin now."""
     return {
         "escs": [
-            {"energy": e.energy_mw_ns, "run_time": e.run_time_ns, "losses": e.losses}
-            for e in gateway.escs
+            {"energy": esc.energy_mw_ns, "run_time": esc.run_time_ns, "losses": esc.losses}
+            for esc in gateway.escs
         ],
         "can_state": int(gateway.status.can_state),
         "started_ns": gateway.status.started_ns,
@@ -143,15 +151,17 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
 
 
 def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
-    """What each ESC's last info frame says of the device now on its line; None where none has come."""
-    return [
-        None
-        if esc.last_info is None
-        else {
+    """Return the device of each ESC according to its last info frame. None before the first."""
+    found: list[dict[str, Any] | None] = []
+    for esc in gateway.escs:
+        if esc.last_info is None:
+            found.append(None)
+            continue
+        device = {
             "device": esc.protocol.device_text(esc.last_info),
             "variant": esc.protocol.value("variant", esc.last_info),
             "firmware": esc.protocol.firmware_text(esc.last_info),
             "layout": esc.protocol.layout_text(esc.layout) or "",
         }
-        for esc in gateway.escs
-    ]
+        found.append(device)
+    return found

@@ -1,7 +1,8 @@
-"""Replays a capture through the gateway's core: the CAN frames that the recorded gateway sent, each at its time.
+"""Replays a capture through the gateway's core.
 
-The core is that of a live run and gets the recorded times, so frames and times equal those of the live run bit for bit as long as no
-entry is missing. Nothing here waits or sends.
+The result is the CAN frames that the recorded gateway sent, each at its time. The same core is used
+as in a live run, with the recorded times. So frames and times are identical to the live run if no
+entry is missing. Nothing waits or is sent.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -23,7 +24,7 @@ from kontronik_can_gw.status import CanState, GatewayState
 
 
 class TimedFrame(NamedTuple):
-    """A CAN frame with its time. ``received``: from the bus; otherwise the gateway sent it."""
+    """A CAN frame with its time. ``received`` is False if the gateway sent it."""
 
     time_ns: int
     frame: CanFrame
@@ -31,10 +32,11 @@ class TimedFrame(NamedTuple):
 
 
 class Replay:
-    """Feeds entries to a gateway. ``marked``: its state on the bus is REPLAY, not RUNNING.
+    """Plays entries on a gateway.
 
-    ``state``: counters in the header. If the beginning of the run is missing (no START entry), the gateway starts with the first entry
-    and adopts the next STATE entry.
+    ``marked``: the gateway's state on the bus is REPLAY instead of RUNNING. ``state``: the counters
+    in the header. If the beginning of the run is missing (no START entry), the gateway starts with
+    the first ADVANCE entry and adopts the next STATE entry.
     """
 
     def __init__(
@@ -48,27 +50,32 @@ class Replay:
         self._marked = marked
         self._waiting = TransmitQueue()
         self._taken: list[TimedFrame] = []
-        """Frames of the last turn; the next entry shows whether they were sent."""
+        """Frames of the last turn. The next entry shows if they were sent."""
         self._started = False
         self._midway = False
+        """True if the beginning of the run is missing and no STATE entry was found yet."""
         self._take_up(state or {})
 
     def follow(self, entries: Iterable[Entry]) -> Iterator[TimedFrame]:
-        """Yield the frames received and sent, in order."""
+        """Yield the frames that were received and sent, in order."""
         for entry in entries:
             yield from self.play(entry)
         yield from self.finish()
 
     def play(self, entry: Entry) -> list[TimedFrame]:
-        """Give one entry to the gateway; return the frames received with it and those sent before it."""
+        """Play one entry on the gateway.
+
+        Returns the frames that were sent before it, and the frame that was received with it.
+        """
         if entry.kind == Kind.NOT_SENT:
             self._taken = []
             return []
-        found, self._taken = self._taken, []
+        found = self._taken
+        self._taken = []
         try:
             found += self._play(entry)
         except Exception:
-            # a damaged or hostile capture can hold calls that no gateway ever made, which may raise anything
+            # the calls of a damaged or hostile capture may raise any exception
             self.rejected += 1
         return found
 
@@ -78,12 +85,13 @@ class Replay:
         return bool(self._taken)
 
     def go_on(self, taken: list[TimedFrame]) -> None:
-        """Take over from another that played this replay's gateway: the frames of its last turn."""
+        """Continue after a player. ``taken``: the frames of its last turn on this gateway."""
         self._taken += taken
 
     def finish(self) -> list[TimedFrame]:
-        """Return the frames of the last turn, after the last entry."""
-        found, self._taken = self._taken, []
+        """Return the frames of the last turn. Must be called after the last entry."""
+        found = self._taken
+        self._taken = []
         return found
 
     def _play(self, entry: Entry) -> list[TimedFrame]:
@@ -138,7 +146,7 @@ class Replay:
 
     def _take(self, now: int) -> None:
         gateway = self.gateway
-        gateway.take_saves()  # unread, the list would grow
+        gateway.take_saves()  # otherwise the list would grow
         frames = in_order(gateway.take_frames(now), self._waiting)
         gateway.status.sent_frames += len(frames)
         gateway.take_link_changes()
@@ -149,9 +157,12 @@ class Replay:
     def _take_up(self, state: Mapping[str, Any]) -> None:
         """Adopt the counters from before the recording began."""
         for esc, found in zip(self.gateway.escs, state.get("escs", ()), strict=False):
-            esc.energy_mw_ns, esc.run_time_ns, esc.losses = (
-                found[name] for name in ("energy", "run_time", "losses")
-            )
+            energy = found["energy"]
+            run_time = found["run_time"]
+            losses = found["losses"]
+            esc.energy_mw_ns = energy
+            esc.run_time_ns = run_time
+            esc.losses = losses
         if "started_ns" in state:
             self.gateway.status.started_ns = state["started_ns"]
         if "can_state" in state:
@@ -171,10 +182,13 @@ _RARE: dict[int, Callable[[Gateway, Entry], object]] = {
     ),
     Kind.DAMAGED: lambda gateway, e: gateway.parameters_damaged(e.esc, e.time_ns),
 }
-"""Calls of the gateway that are made now and then; an unknown kind raises KeyError."""
+"""Calls of the gateway for the rarer kinds. An unknown kind raises KeyError."""
 
 
 def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:
-    """The frames of one turn in the order in which the interface gets them. ``waiting``: the queue, the same for each turn."""
+    """Return the frames of one turn in the order in which they are passed to the interface.
+
+    ``waiting`` is the transmit queue, the same one for each turn.
+    """
     waiting.put_all(frames)
     return waiting.take_all()

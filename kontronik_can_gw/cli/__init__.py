@@ -1,6 +1,9 @@
-"""The command line: ``kontronik-can-gw COMMAND``. One module per command, which is imported only when it is given.
+"""The command line: ``kontronik-can-gw COMMAND``.
 
-Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data goes to standard output, messages to standard error.
+Each command has a module, which is imported only if the command is given.
+
+Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data is written to
+standard output, messages to standard error.
 """
 
 import argparse
@@ -24,7 +27,10 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
 
 _CLOSED_OUTPUT = 128 + signal.SIGPIPE
-"""Exit code if nobody reads the output any more: a shell shows this for a program that SIGPIPE ended."""
+"""Exit code if the reader of the output has closed it.
+
+A shell shows this code for a program that SIGPIPE ended.
+"""
 COMMANDS = {
     "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
     "run": "run the gateway: send ESC telemetry as DBC messages, CANopen and DroneCAN",
@@ -54,19 +60,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     try:
         return _run(list(sys.argv[1:] if argv is None else argv))
-    except BrokenPipeError:  # the reader of our output has ended, as `| head` does
+    except BrokenPipeError:  # the reader of the output has ended, for example `| head`
         discard_output()
         return _CLOSED_OUTPUT
 
 
 def _run(words: list[str]) -> int:
-    """Run one command. BrokenPipeError if nobody reads its output or its messages any more."""
+    """Run one command. Raises BrokenPipeError if a reader has closed its output or messages."""
     command = next((word for word in words if not word.startswith("-")), None)
     try:
         _prepare_streams()
         refuse_removed_options(command, words)
         args = _parsed(command, words)
-        # before, while modules are loaded, Ctrl-C ends the process (see __main__)
+        # until here, while modules were loaded, Ctrl-C ended the process (see __main__)
         if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         code: int = args.main(args)
@@ -94,19 +100,21 @@ def _run(words: list[str]) -> int:
 
 
 def _parsed(command: str | None, words: list[str]) -> argparse.Namespace:
+    parser = make_parser([] if command is None else [command])
     try:
-        return make_parser([] if command is None else [command]).parse_args(words)
+        return parser.parse_args(words)
     except SystemExit:
-        for stream in (
-            sys.stdout,
-            sys.stderr,
-        ):  # a failure at the very end would be reported by Python
-            stream.flush()
+        # if this failed when Python exits, Python would print an error
+        sys.stdout.flush()
+        sys.stderr.flush()
         raise
 
 
 def discard_output() -> None:
-    """Discard the buffered part of standard output and all further output, and so for messages that nobody reads."""
+    """Discard the buffered part of standard output, and all further output.
+
+    Messages are discarded, too, if their reader has closed standard error.
+    """
     _discard(sys.stdout)
     try:
         sys.stderr.flush()
@@ -120,23 +128,27 @@ def _discard(stream: TextIO) -> None:
 
 def say(text: str, command: str | None = None) -> None:
     """Print one line on standard error."""
-    print(
-        printable(f"kontronik-can-gw{'' if command is None else f' {command}'}: {text}"),
-        file=sys.stderr,
-    )
+    name = "kontronik-can-gw"
+    if command is not None:
+        name += f" {command}"
+    print(printable(f"{name}: {text}"), file=sys.stderr)
 
 
 def show(text: str = "") -> None:
-    """Print one line on standard output, made printable."""
+    """Print one printable line on standard output."""
     print(printable(text))
 
 
 def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
-    """The parser of the program. Only commands in ``complete`` get their options; a run needs only those of one command."""
+    """Return the parser of the program.
+
+    Only the commands in ``complete`` have their options, because their modules must be imported. A
+    run needs the options of one command.
+    """
     parser = Parser(
         prog="kontronik-can-gw",
-        description="Gateway from KONTRONIK ESC telemetry (UART) to CAN: messages of a DBC, CANopen nodes of an EDS, and "
-        "DroneCAN.",
+        description="Gateway from KONTRONIK ESC telemetry (UART) to CAN: "
+        "messages of a DBC, CANopen nodes of an EDS, and DroneCAN.",
         epilog="kontronik-can-gw COMMAND --help describes a command.",
         allow_abbrev=False,
     )
@@ -151,13 +163,18 @@ def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.Argumen
 
 
 def _complete(parser: argparse.ArgumentParser, module: ModuleType) -> None:
-    """Declare what a command's module has: OPTIONS, EPILOG, ``main``, and ACTIONS (each a line and its options) if there are any."""
+    """Add the options, help and main function of a command's module to its parser.
+
+    The module has OPTIONS, EPILOG and ``main``. It may have ACTIONS, each with a line of help and
+    its options.
+    """
     add_options(parser, module.OPTIONS)
     parser.epilog = module.EPILOG
     if "\n" in module.EPILOG:
         parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.set_defaults(main=module.main)
-    if actions := getattr(module, "ACTIONS", None):
+    actions = getattr(module, "ACTIONS", None)
+    if actions:
         subs = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
         for name, (line, options) in actions.items():
             text = line[0].upper() + line[1:] + "."
@@ -166,16 +183,20 @@ def _complete(parser: argparse.ArgumentParser, module: ModuleType) -> None:
 
 
 class _Plain(logging.Formatter):
-    """Formats log records of libraries without a handler of their own; made printable, since they quote files."""
+    """Formats log records of libraries that have no handler.
+
+    They are made printable, because they contain the names and contents of files.
+    """
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(f"kontronik-can-gw: {record.getMessage()}")
 
 
 def _prepare_streams() -> None:
-    """Make the three standard streams safe to use, and allow as many open files as can be.
+    """Make the three standard streams safe, and allow the greatest number of open files.
 
-    A closed one is replaced: if a serial port got its number, messages would be sent to an ESC.
+    A closed stream is replaced. Otherwise a serial port could get its number, and messages would be
+    sent to an ESC.
     """
     with suppress(ValueError, OSError):
         _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -185,11 +206,11 @@ def _prepare_streams() -> None:
     for number in range(3):
         try:
             os.fstat(number)
-        except OSError:  # closed: no serial port may get this number, see below
+        except OSError:  # it is closed
             os.open(os.devnull, os.O_RDWR)
-    for name in ("stdout", "stderr"):  # messages must not go to standard output instead
+    for name in ("stdout", "stderr"):  # otherwise messages would be written to standard output
         if getattr(sys, name) is None:
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115  for the whole run
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal without "µ" gets a "?"
+            stream.reconfigure(errors="replace")  # a terminal without "µ" shows "?"

@@ -1,4 +1,4 @@
-"""Options of commands as rows of a table, and what several commands share of them."""
+"""Declares options of commands as rows of a table, and defines options of several commands."""
 
 import argparse
 import tomllib
@@ -8,28 +8,33 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.errors import UserError, did_you_mean
 
-REMOVED_OPTIONS: dict[tuple[str, str], str] = {
-    (command, removed): advice
-    for command, rows in tomllib.loads(
-        Path(__file__).with_name("removed_options.toml").read_text(encoding="ascii")
-    ).items()
-    for removed, advice in rows.items()
-}
-"""By command and option, and what to type instead."""
+REMOVED_OPTIONS: dict[tuple[str, str], str] = {}
+"""The replacement of each removed option, by command and option."""
+_removed_text = Path(__file__).with_name("removed_options.toml").read_text(encoding="ascii")
+for _command, _rows in tomllib.loads(_removed_text).items():
+    for _removed, _advice in _rows.items():
+        REMOVED_OPTIONS[_command, _removed] = _advice
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser of one command. A mistake shows the usage of this command, and what was meant."""
+    """The parser of one command.
+
+    For a mistake it shows the usage of this command, and suggests the closest option.
+    """
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse. Exits with the usage for options that do not exist, so that no word is left over."""
-        if unknown := self._unknown_options(args or ()):
+        """Parse arguments. Exits with the usage if an option does not exist.
+
+        So the returned list of remaining words is always empty.
+        """
+        unknown = self._unknown_options(args or ())
+        if unknown:
             self._refuse(unknown)
         found, rest = super().parse_known_args(args, namespace)
         for action in self._actions:
-            # argparse takes an optional argument for missing if it comes after an option
+            # argparse treats an optional argument as missing if it follows an option
             is_text = not action.option_strings and action.type is None
             is_missing = is_text and action.nargs == "?" and getattr(found, action.dest) is None
             if is_missing and rest and (rest[0] == "-" or not rest[0].startswith("-")):
@@ -39,22 +44,30 @@ class Parser(argparse.ArgumentParser):
         return found, rest
 
     def _unknown_options(self, args: Sequence[str]) -> list[str]:
-        """The long options that do not exist. argparse often names only missing arguments."""
+        """Return the long options that do not exist.
+
+        argparse often reports only missing arguments in this case.
+        """
         has_commands = any(isinstance(one, argparse._SubParsersAction) for one in self._actions)
         unknown = []
         for word in args:
             if word == "--" or (has_commands and not word.startswith("-")):
                 break  # the options of a command are checked by its own parser
-            if word.startswith("--") and word.partition("=")[0] not in self._option_string_actions:
+            name = word.partition("=")[0]
+            if name.startswith("--") and name not in self._option_string_actions:
                 unknown.append(word)
         return unknown
 
     def _refuse(self, words: Sequence[str]) -> None:
-        """Exit with an error that names words without a meaning."""
+        """Exit with an error that lists the unknown words."""
         known = [name[2:] for name in self._option_string_actions if name.startswith("--")]
-        # the dashes, which all have, would make any two names look alike
-        near = did_you_mean(words[0].partition("=")[0].lstrip("-"), known, show="--{}".format)
-        self.error(f"unrecognized arguments: {' '.join(words)}{near and '.'}{near}")
+        # names are compared without their dashes, which would make any two of them similar
+        name = words[0].partition("=")[0].lstrip("-")
+        near = did_you_mean(name, known, show="--{}".format)
+        text = f"unrecognized arguments: {' '.join(words)}"
+        if near:
+            text += f".{near}"
+        self.error(text)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
@@ -63,18 +76,25 @@ class Parser(argparse.ArgumentParser):
 
 
 class Option(NamedTuple):
-    """An option or argument, with the words for ``add_argument``."""
+    """An option or argument with its parameters for ``add_argument``."""
 
     names: Sequence[str]
     settings: dict[str, Any]
 
 
 Rows = Sequence["Option | str | Rows"]
-"""Options of a command. A text is the title of the group of those after it; of rows in a row only one may be given."""
+"""Options of a command.
+
+A text is the title of the group of options after it. Of the rows in an inner sequence only one may
+be given.
+"""
 
 
 def option(typed: str, text: str, **settings: Any) -> Option:
-    """An option by what is typed, as "-c --config FILE", a switch as "--json", or an argument as "FILE"; ``text`` is its help."""
+    """Return an option by its spelling, with ``text`` as its help.
+
+    Examples are the option "-c --config FILE", the switch "--json", and the argument "FILE".
+    """
     *names, last = typed.split()
     if last.startswith("-"):
         names.append(last)
@@ -87,7 +107,7 @@ def option(typed: str, text: str, **settings: Any) -> Option:
 
 
 def add_options(parser: "argparse._ActionsContainer", rows: Rows) -> None:
-    """Declare options."""
+    """Add options to a parser."""
     group = parser
     for row in rows:
         if isinstance(row, str):
@@ -105,7 +125,7 @@ def number_from(
     *,
     kind: Callable[[str], float] = float,
 ) -> Callable[[str], float]:
-    """An argparse type: a number within a range. ``kind``: ``int`` for whole ones."""
+    """Return a type for argparse: a number within a range. ``kind``: ``int`` for whole numbers."""
 
     def read(text: str) -> float:
         try:
@@ -120,7 +140,10 @@ def number_from(
 
 
 class _Named(argparse.Action):
-    """Stores the configuration that stands without -c; where there is none, what -c has given stays."""
+    """Stores the configuration that is given without -c.
+
+    If there is none, the configuration given with -c is kept.
+    """
 
     def __call__(self, _parser: object, namespace: object, values: Any, _: object = None) -> None:
         if values is not None:
@@ -128,9 +151,8 @@ class _Named(argparse.Action):
 
 
 CONFIG_PLACES = (Path("gateway.toml"), Path("/etc/kontronik-can-gw/gateway.toml"))
-"""Where a configuration is looked for that is not named, in this order."""
+"""The places of the default configuration, in the order in which they are tried."""
 _DEFAULTS = " or ".join(map(str, CONFIG_PLACES))
-# fmt: off
 CONFIG = (
     option("-c --config FILE", f"TOML configuration (default: {_DEFAULTS})", type=Path),
     option("config FILE", "TOML configuration, as with -c", type=Path, nargs="?", action=_Named),
@@ -143,46 +165,66 @@ OUTPUT: "Rows" = (
 )
 LAYOUT = (
     option("-c --config FILE", "TOML configuration of the gateway that sent the frames", type=Path),
-    option("--dbc FILE", "DBC of the frames (default on a live bus: the DBC of gateway.toml; otherwise the shipped one)", type=Path),
+    option(
+        "--dbc FILE",
+        "DBC of the frames (default on a live bus: the DBC of gateway.toml; "
+        "otherwise the shipped one)",
+        type=Path,
+    ),
 )
-LOG_CHANNEL = option("--channel NAME", "channel of a CAN log, for example can0 or 1 (default: the only one with messages of the DBC)")
-# fmt: on
+LOG_CHANNEL = option(
+    "--channel NAME",
+    "channel of a CAN log, for example can0 or 1 (default: the only one with messages of the DBC)",
+)
 
 
 def config_file(given: Path | None) -> Path:
-    """The configuration that is named, or the first of CONFIG_PLACES that exists. UserError where there is none."""
+    """Return the given configuration, or the first of CONFIG_PLACES that exists.
+
+    Raises UserError if there is none.
+    """
     found = given or default_config()
     if found is None:
         raise UserError(
-            f"there is no {_DEFAULTS}. Name the configuration: -c FILE; kontronik-can-gw init writes an example."
+            f"there is no {_DEFAULTS}. Name the configuration: -c FILE; "
+            "kontronik-can-gw init writes an example."
         )
     return found
 
 
 def default_config() -> Path | None:
-    """The first of CONFIG_PLACES that is there: a link that leads nowhere, and what a closed folder hides, too."""
+    """Return the first of CONFIG_PLACES that exists.
+
+    A broken link counts as existing, and so does a file in an inaccessible folder.
+    """
     for place in CONFIG_PLACES:
         try:
             place.lstat()
         except (FileNotFoundError, NotADirectoryError):
             continue
         except OSError:
-            pass  # reading it says why it cannot be
+            pass  # reading it will raise an error with the reason
         return place
     return None
 
 
 def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
-    """UserError with the replacement where a command line has a removed option, or a removed action after the command."""
-    options = words[: words.index("--")] if "--" in words else words
-    parts = [
-        part
-        for word in options
-        for part in (word.split("=", 1) if word.startswith("--") else [word])
-    ]
-    for before, part, value in zip(["", *parts], parts, [*parts[1:], ""], strict=False):
-        if not part.startswith("-") and before != command:
+    """Raise UserError with the replacement if the command line has a removed option or action.
+
+    An action is the word after the command.
+    """
+    parts: list[str] = []
+    for word in words:
+        if word == "--":
+            break
+        parts += word.split("=", 1) if word.startswith("--") else [word]
+    before = ""
+    for part, value in zip(parts, [*parts[1:], ""], strict=True):
+        is_action = before == command
+        before = part
+        if not part.startswith("-") and not is_action:
             continue  # the value of an option
         for removed in (part, f"{part} {value}"):
-            if (advice := REMOVED_OPTIONS.get((command or "", removed))) is not None:
+            advice = REMOVED_OPTIONS.get((command or "", removed))
+            if advice is not None:
                 raise UserError(f"{removed}: was removed. {advice}")

@@ -1,4 +1,4 @@
-"""Shared by several commands: the log, signals, and warnings of a configuration on standard error."""
+"""Functions of several commands: the log, signals, and warnings about a configuration."""
 
 import logging
 import signal
@@ -29,9 +29,9 @@ def load_all(path: Path, store: "Callable[[Path], ParameterStore] | None" = None
 
 
 def announced_config(with_nodes: bool = False) -> Path | None:
-    """The configuration to be used where an option might have named one, which a line on standard error says; None: there is none.
+    """Return the default configuration for a command without ``-c``, and print its name.
 
-    ``with_nodes``: only one with CANopen nodes.
+    None if there is no such configuration. ``with_nodes``: it must have CANopen nodes.
     """
     found = default_config()
     if found is None or (with_nodes and not load(found).canopen.enabled):
@@ -42,15 +42,19 @@ def announced_config(with_nodes: bool = False) -> Path | None:
 
 @contextmanager
 def logging_to_stderr() -> Iterator[None]:
-    """Write log lines to standard error from a thread; under systemd without time, with journald's priorities."""
+    """Write log lines to standard error from a thread.
+
+    Under systemd they have the priorities of journald instead of a time.
+    """
     from kontronik_can_gw.runtime.system.fault_log import BackgroundHandler
     from kontronik_can_gw.runtime.system.sd_notify import log_formatter
 
     handler = BackgroundHandler(sys.stderr)
-    handler.setFormatter(
-        log_formatter(sys.stderr) or logging.Formatter("%(asctime)s %(levelname)-7s %(message)s")
-    )
-    # faults that python-can logs are logged by the gateway too, with the remedy
+    formatter = log_formatter(sys.stderr)
+    if formatter is None:
+        formatter = logging.Formatter("%(asctime)s %(levelname)-7s %(message)s")
+    handler.setFormatter(formatter)
+    # the gateway itself logs the faults that python-can logs, with their remedies
     logging.getLogger("can").addHandler(logging.NullHandler())
     logger = logging.getLogger("kontronik_can_gw")
     logger.addHandler(handler)
@@ -64,9 +68,10 @@ def logging_to_stderr() -> Iterator[None]:
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[], None]) -> Iterator[list[str]]:
-    """SIGTERM, SIGINT and SIGHUP call ``stop``, a second one ends the process at once. Under nohup SIGHUP stays ignored.
+    """Call ``stop`` for SIGTERM, SIGINT and SIGHUP. A second signal ends the process at once.
 
-    Yields a list that holds the signal's name once it was received.
+    Under nohup SIGHUP stays ignored. Yields a list that contains the signal's name after a signal
+    was received.
     """
     received: list[str] = []
     numbers = [signal.SIGTERM, signal.SIGINT]
@@ -87,18 +92,22 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[list[str]]:
             signal.signal(number, old)
 
 
-def canopen_setups(loaded: Loaded) -> "list[CanopenSetup]":
-    """Return the CANopen setup of a configuration in a list, which is empty without nodes."""
+def canopen_setup(loaded: Loaded) -> "CanopenSetup | None":
+    """Return the CANopen setup of a configuration. None if it has no nodes."""
     from kontronik_can_gw.canopen.setup import CanopenSetup
 
-    return [setup for setup in loaded.outputs if isinstance(setup, CanopenSetup)]
+    for setup in loaded.outputs:
+        if isinstance(setup, CanopenSetup):
+            return setup
+    return None
 
 
 def canopen_of(loaded: Loaded) -> "CanopenSetup":
-    """Return the CANopen setup of a configuration. UserError if it has no nodes."""
-    setups = canopen_setups(loaded)
-    if not setups:
+    """Return the CANopen setup of a configuration. Raises UserError if it has no nodes."""
+    setup = canopen_setup(loaded)
+    if setup is None:
         raise UserError(
-            f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. Set it to true."
+            f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. "
+            "Set it to true."
         )
-    return setups[0]
+    return setup

@@ -1,4 +1,7 @@
-"""``completion``: prints a script for a shell to complete commands, options, choices and file names. shtab makes it from the parser."""
+"""``completion``: prints a script for a shell to complete commands, options and file names.
+
+shtab makes it from the parser.
+"""
 
 import argparse
 from collections.abc import Iterator
@@ -33,11 +36,11 @@ _KINDS = dict.fromkeys(("FILE", "SOURCE", "PATH", "IN", "OUT"), shtab.FILE) | {
     "DIR": shtab.DIRECTORY
 }
 _ENDINGS = {"config": ("*.toml",), "dbc": ("*.dbc", "*.DBC"), "from": ("*.dbc", "*.DBC")}
-"""File name endings for options, by their attribute name."""
+"""Endings of file names for options, by the attribute name of the option."""
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print the script. RunError where the installed shtab is too old for the shell."""
+    """Print the script. Raises RunError if the installed shtab is too old for the shell."""
     if args.shell not in shtab.SUPPORTED_SHELLS:
         raise RunError(
             f"{args.shell}: needs a newer shtab than {shtab.__version__}. "
@@ -46,7 +49,8 @@ def main(args: argparse.Namespace) -> int:
     parser = make_parser()
     for action in _actions(parser):
         complete = _KINDS.get(str(action.metavar))
-        if endings := _ENDINGS.get(action.dest):
+        endings = _ENDINGS.get(action.dest)
+        if endings:
             complete = shtab.glob(*endings)
         if complete is not None:
             action.complete = complete  # type: ignore[attr-defined]
@@ -55,7 +59,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Every option and argument of a parser and of its commands."""
+    """Yield all options and arguments of a parser and of its commands."""
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):

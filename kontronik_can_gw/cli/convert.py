@@ -38,7 +38,7 @@ _STOPPED = 130
 
 
 def _seconds_ns(text: str) -> int:
-    """A type for argparse: seconds as ns."""
+    """Return seconds as ns. A type for argparse."""
     try:
         number = Decimal(text)
         if number.is_finite() and 0 <= number < 10**9:
@@ -49,14 +49,13 @@ def _seconds_ns(text: str) -> int:
 
 
 def _names(text: str) -> list[str]:
-    """A type for argparse: names with commas between."""
+    """Return the names in a text with commas between them. A type for argparse."""
     found = [name.strip() for name in text.split(",") if name.strip()]
     if not found:
         raise argparse.ArgumentTypeError("give names of signals, with commas between")
     return found
 
 
-# fmt: off
 OPTIONS = (
     option("IN", "capture, CAN log or UART bytes, or - for standard input", dest="input"),
     option("OUT", "file to write, or - for standard output", nargs="?"),
@@ -67,14 +66,22 @@ OPTIONS = (
     LAYOUT,
     LOG_CHANNEL,
     "a part of it",
-    option("--from S", "from this time after the start, in seconds", type=_seconds_ns, dest="start"),
-    option("--until S", "up to this time after the start, in seconds", type=_seconds_ns, dest="end"),
+    option(
+        "--from S", "from this time after the start, in seconds", type=_seconds_ns, dest="start"
+    ),
+    option(
+        "--until S", "up to this time after the start, in seconds", type=_seconds_ns, dest="end"
+    ),
     "tables",
-    option("--signals A,B*", "only these values, in this order; * stands for any characters, ? for one", type=_names, default=[]),
+    option(
+        "--signals A,B*",
+        "only these values, in this order; * stands for any characters, ? for one",
+        type=_names,
+        default=[],
+    ),
     "bin",
     option("--esc NAME", "the ESC whose bytes to write, if there are several"),
 )
-# fmt: on
 EPILOG = """\
 IN is a capture of this gateway (.kcap; a folder stands for all parts of a
 run), a log of CAN frames (candump, Vector ASC or BLF, PEAK TRC, MF4 bus
@@ -108,7 +115,10 @@ cannot be opened or is not a recording; 130 stopped by a signal
 
 
 def main(args: argparse.Namespace, opened_by: OpenInput = open_input) -> int:
-    """Convert args.input, which ``opened_by`` opens. UserError for wrong usage, RunError if something cannot be read or written."""
+    """Convert ``args.input``, which is opened with ``opened_by``. Returns the exit code.
+
+    Raises UserError for wrong usage, and RunError if a file cannot be read or written.
+    """
     args.output = output_of(args, "OUT")
     inputs = [*recording_files(Path(args.input)), *configuration_files(args.config, args.dbc)]
     check_output(args.output, inputs, force=args.force)
@@ -142,7 +152,10 @@ def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
 def _report(
     args: argparse.Namespace, form: str, recording: Input, summary: str | None, seconds: float
 ) -> None:
-    """Report the result and the damage. RunError or UserError if there was nothing to convert."""
+    """Report the result and the damage.
+
+    Raises RunError or UserError if there was nothing to convert.
+    """
     source = name_of(Path(args.input))
     damage = [f"{source}: damaged: {line}" for line in recording.damage]
     if summary is None:
@@ -156,21 +169,30 @@ def _report(
         say(f"{where}: {summary}, in {seconds:.1f} s", args.command)
         if "times" in recording.provenance and form != BYTES:
             say(f"times are {recording.provenance['times']}", args.command)
-    for line in (*damage, *(f"{args.input}: {note}" for note in recording.clock_notes)):
+    for line in damage:
         say(line, args.command)
+    for note in recording.clock_notes:
+        say(f"{args.input}: {note}", args.command)
 
 
 def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
-    """Why there is nothing to convert."""
+    """Return the reason why there is nothing to convert."""
     if args.start is not None or args.end is not None:
         return "nothing in it is between --from and --until"
     if recording.others:
-        return f"nothing in it can be converted: no frame of {recording.bus.layout.file}. Give the right DBC by --dbc or -c."
-    return f"nothing in it can be converted: it has no {'values' if form in TABLES else 'frames'}."
+        return (
+            f"nothing in it can be converted: no frame of {recording.bus.layout.file}. "
+            "Give the right DBC by --dbc or -c."
+        )
+    missing = "values" if form in TABLES else "frames"
+    return f"nothing in it can be converted: it has no {missing}."
 
 
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
-    """What is to be done with recording and output. UserError for what the recording has not."""
+    """Return the function that converts a recording to an output.
+
+    Raises UserError if the recording does not have the requested signal or ESC.
+    """
     if form == BYTES:
         return partial(to_bytes, esc=_esc(args, recording))
     times = {"start_ns": args.start, "end_ns": args.end}
@@ -190,35 +212,39 @@ def _format(args: argparse.Namespace) -> str:
         raise UserError(f"{args.output}: {REMOVED_OPTIONS['convert', '--to mf4']}")
     if suffix not in SUFFIXES:
         raise UserError(
-            f"{args.output}: its suffix tells no format. Give --to, or one of these suffixes: {' '.join(SUFFIXES)}"
+            f"{args.output}: its suffix tells no format. Give --to, or one of these suffixes: "
+            f"{' '.join(SUFFIXES)}"
         )
     return SUFFIXES[suffix]
 
 
 def _check(args: argparse.Namespace, form: str) -> None:
-    """Wrong usage that is known before anything is opened. UserError."""
-    to_screen, start, end = args.output == "-", args.start, args.end
-    is_bytes = form == BYTES
-    # fmt: off
-    rules = (
-        (to_screen and form not in ON_SCREEN,
-         f"{form} cannot go to standard output. Give a file, or one of these: {', '.join(ON_SCREEN)}"),
-        (args.signals and form not in TABLES, f"--signals is for tables ({', '.join(TABLES)}), not for {form}"),
-        (args.esc is not None and not is_bytes, f"--esc is for bin, not for {form}; leave it out, or --signals 'NAME.*' of several ESCs"),
-        (is_bytes and not (start is None and end is None), "--from and --until are not for bin, which has no times"),
-        (start is not None and end is not None and end < start, "--until is before --from"),
-    )
-    # fmt: on
-    for is_wrong, problem in rules:
-        if is_wrong:
-            raise UserError(problem)
+    """Raise UserError for wrong usage that is known before anything is opened."""
+    to_screen = args.output == "-"
+    has_start = args.start is not None
+    has_end = args.end is not None
+    if to_screen and form not in ON_SCREEN:
+        raise UserError(
+            f"{form} cannot go to standard output. "
+            f"Give a file, or one of these: {', '.join(ON_SCREEN)}"
+        )
+    if args.signals and form not in TABLES:
+        raise UserError(f"--signals is for tables ({', '.join(TABLES)}), not for {form}")
+    if args.esc is not None and form != BYTES:
+        raise UserError(
+            f"--esc is for bin, not for {form}; leave it out, or --signals 'NAME.*' of several ESCs"
+        )
+    if form == BYTES and (has_start or has_end):
+        raise UserError("--from and --until are not for bin, which has no times")
+    if has_start and has_end and args.end < args.start:
+        raise UserError("--until is before --from")
     target = Path(args.output)
     if not to_screen and target.exists() and not target.is_file() and form not in ON_SCREEN:
         raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
 
 
 def _esc(args: argparse.Namespace, recording: Input) -> int:
-    """Index of the ESC that --esc names, or of the only one. UserError."""
+    """Return the index of the ESC of --esc, or of the only one. Raises UserError if unclear."""
     names = [esc.name for esc in recording.bus.escs]
     if args.esc is None and len(names) > 1:
         raise UserError(f"bin holds the bytes of one ESC. Give --esc: {', '.join(names)}")

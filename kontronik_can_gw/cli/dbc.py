@@ -1,4 +1,7 @@
-"""``dbc``: writes the DBC of several ESCs from a one-ESC DBC, or of exactly what a configuration or its CANopen nodes send."""
+"""``dbc``: writes a DBC.
+
+It describes several ESCs by a one-ESC DBC, the messages of a configuration, or its CANopen nodes.
+"""
 
 import argparse
 import re
@@ -20,18 +23,23 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
 _ESCS = number_from(1, 127, "number of ESCs", kind=int)
-# fmt: off
 OPTIONS = (
-    option("-c --config FILE", "write the DBC of the messages that this configuration sends", type=Path),
-    option("--canopen", "write the DBC of the CANopen nodes: PDOs as mapped now, heartbeats, emergencies"),
+    option(
+        "-c --config FILE", "write the DBC of the messages that this configuration sends", type=Path
+    ),
+    option(
+        "--canopen",
+        "write the DBC of the CANopen nodes: PDOs as mapped now, heartbeats, emergencies",
+    ),
     option("--from DBC", "DBC for one ESC to start from (default: the shipped one)", type=Path),
     option("--esc N", "number of ESCs, which are named esc1, esc2 ... (default 1)", type=_ESCS),
     *OUTPUT,
 )
-# fmt: on
 EPILOG = (
-    "Prints a DBC that every tool can read, and warnings on standard error. The VERSION in it ends with the fingerprint of "
-    "the layout. check, status, captures and report show the same fingerprint, so you can recognise an outdated file. "
+    "Prints a DBC that every tool can read, and warnings on standard error. "
+    "The VERSION in it ends with the fingerprint of "
+    "the layout. check, status, captures and report show the same fingerprint, so you can "
+    "recognise an outdated file. "
     "To choose names, ids and nodes, use the keys of a configuration. "
     "Exit codes: 0 done; 1 the file cannot be written; 2 wrong usage, configuration or DBC."
 )
@@ -50,13 +58,14 @@ def main(args: argparse.Namespace) -> int:
         text = _canopen(args.config, escs)
     else:
         text = _messages(args.config, source or shipped("dbc/kontronik_esc.dbc"), escs)
-    encoding = "cp1252"  # what tools assume; usually the text is ASCII
+    encoding = "cp1252"  # the encoding that tools assume; usually the text is ASCII
     try:
         text.encode(encoding)
     except UnicodeEncodeError:
         encoding = "utf-8"
         say(
-            "warning: written in UTF-8, because it has characters that Windows-1252, the usual encoding of a DBC, has not"
+            "warning: written in UTF-8, because it has characters that Windows-1252, the usual "
+            "encoding of a DBC, has not"
         )
     inputs = configuration_files(args.config, source)
     write_output(args.output, text, inputs, force=args.force, encoding=encoding)
@@ -66,28 +75,37 @@ def main(args: argparse.Namespace) -> int:
 def _canopen(config: Path | None, escs: list[EscSettings]) -> str:
     if config is not None:
         loaded = load_all(config)
-        setup, escs = canopen_of(loaded), loaded.escs
+        setup = canopen_of(loaded)
+        escs = loaded.escs
     else:
         setup = shipped_canopen(range(1, len(escs) + 1))
         escs = setup.esc_settings(escs)
     nodes = setup.nodes(escs)
-    if waiting := waiting_for_lss(nodes, escs):
+    waiting = waiting_for_lss(nodes, escs)
+    if waiting:
         say(
-            f"warning: {', '.join(waiting)}: no node-ID yet (LSS gives one), so no frames to describe"
+            f"warning: {', '.join(waiting)}: no node-ID yet (LSS gives one), so no frames to "
+            "describe"
         )
     return pdo_text(nodes, escs)
 
 
 def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> str:
-    """The messages of a configuration, else of these ESCs by a DBC for one. UserError for mistakes that the gateway refuses."""
+    """Return the DBC of a configuration, or of these ESCs by the one-ESC DBC in ``file``.
+
+    Raises UserError for mistakes that the gateway refuses.
+    """
     settings = DbcConfig()
     if config is not None:
         loaded = load_all(config)
         if loaded.database is None:
             raise UserError(
-                f"{config}: dbc.enabled is false: no messages of a DBC are sent. --canopen writes those of the nodes."
+                f"{config}: dbc.enabled is false: no messages of a DBC are sent. "
+                "--canopen writes those of the nodes."
             )
-        plain, layout, escs = loaded.database, loaded.layout, loaded.escs
+        plain = loaded.database
+        layout = loaded.layout
+        escs = loaded.escs
         settings = loaded.config.dbc
     else:
         ignored: list[str] = []

@@ -1,4 +1,4 @@
-"""``decode``: a table of recorded UART bytes on standard output, as ``convert`` makes it."""
+"""``decode``: writes a table of recorded UART bytes to standard output, as ``convert`` does."""
 
 import argparse
 
@@ -28,9 +28,10 @@ or is not a recording; 130 stopped by a signal
 
 
 def main(args: argparse.Namespace) -> int:
-    """Decode args.file. RunError if nothing is found, or the output cannot be written."""
+    """Decode ``args.file``. Raises RunError if it has no frame, or the output cannot be written."""
     form = "csv" if args.csv else "jsonl"
     given = make_parser(["convert"]).parse_args(["convert", "--to", form, "--", args.file])
-    given.output, given.force = args.output, args.force
+    given.output = args.output
+    given.force = args.force
     given.command = args.command
     return convert.main(given, open_bytes)

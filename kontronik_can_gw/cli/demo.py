@@ -1,4 +1,4 @@
-"""``demo``: shows the gateway at work without hardware, vcan or privileges: the monitor on a simulated bus."""
+"""``demo``: shows the monitor on a simulated bus, without hardware, vcan or privileges."""
 
 import argparse
 import math
@@ -11,20 +11,26 @@ from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.watch import watch
 from kontronik_can_gw.desk.sources import DemoBus
 
-# fmt: off
 OPTIONS = (
-    option("--seconds N", "end after N seconds (default: only with q or Ctrl-C)", type=number_from(0.001, 1e6), default=math.inf),
+    option(
+        "--seconds N",
+        "end after N seconds (default: only with q or Ctrl-C)",
+        type=number_from(0.001, 1e6),
+        default=math.inf,
+    ),
     option("--seed N", "seed of the simulated faults (default 1)", type=int, default=1),
 )
-# fmt: on
 EPILOG = (
-    "Runs a simulated ESC with simulated faults, the gateway, and the monitor. For real ports and a real bus "
+    "Runs a simulated ESC with simulated faults, the gateway, and the monitor. "
+    "For real ports and a real bus "
     "use simulate, run and monitor. Exit codes: 0 ended, 2 wrong usage."
 )
 
 
 def main(args: argparse.Namespace) -> int:
-    stop, end, bus = Event(), time.monotonic() + args.seconds, DemoBus(args.seed)
+    stop = Event()
+    end = time.monotonic() + args.seconds
+    bus = DemoBus(args.seed)
     monitor = Monitor(bus.bus)
     say("the ESC and its faults are simulated; the gateway and the monitor are the real ones")
     with stopping_on_signals(stop.set):

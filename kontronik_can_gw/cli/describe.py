@@ -1,12 +1,12 @@
-"""``describe``: the tables of docs/reference, made of the DBC and EDS in use."""
+"""``describe``: writes the tables of docs/reference for the DBC and EDS in use."""
 
 import argparse
 from pathlib import Path
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.canopen.setup import shipped_canopen
+from kontronik_can_gw.canopen.setup import CanopenSetup, shipped_canopen
 from kontronik_can_gw.cli.arguments import OUTPUT, option
-from kontronik_can_gw.cli.common import announced_config, canopen_setups, load_all
+from kontronik_can_gw.cli.common import announced_config, canopen_setup, load_all
 from kontronik_can_gw.cli.desk import bus_layout
 from kontronik_can_gw.cli.output import configuration_files, write_output
 from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
@@ -15,7 +15,6 @@ from kontronik_can_gw.desk.describe.tables import dbc, values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.printable import printable, printable_json
 
-# fmt: off
 OPTIONS = (
     (
         option("-c --config FILE", "describe the gateway with this TOML configuration", type=Path),
@@ -24,7 +23,6 @@ OPTIONS = (
     option("--format", "default: md", choices=("md", "json"), default="md"),
     *OUTPUT,
 )
-# fmt: on
 EPILOG = """\
 Describes the messages and signals of the DBC in use, the CANopen nodes with
 their objects and emergencies, all values, and error bits and states with
@@ -42,7 +40,7 @@ _TITLE = "What the gateway sends and what it means"
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write the description. UserError for faulty input files, RunError where it cannot be written."""
+    """Write the description. Raises UserError for faulty input, RunError if writing fails."""
     tables = _tables(args)
     text = markdown(_TITLE, [f"Made by kontronik-can-gw {__version__} describe."], tables)
     if args.format == "json":
@@ -57,18 +55,23 @@ def main(args: argparse.Namespace) -> int:
 def _tables(args: argparse.Namespace) -> list[Table]:
     if args.config is None and args.dbc is None:
         args.config = announced_config()
+    bus: BusLayout | None = None
+    nodes: CanopenSetup | None = None
     if args.config is None:
-        shown = bus_layout(args)
-        bus, escs = [shown], shown.escs
-        nodes = [shipped_canopen(range(1, len(escs) + 1))]
+        bus = bus_layout(args)
+        escs = bus.escs
+        nodes = shipped_canopen(range(1, len(escs) + 1))
     else:
         loaded = load_all(args.config)
-        escs, found = loaded.escs, loaded.database
-        bus = [BusLayout(found, loaded.layout, escs, loaded.config)] if found else []
-        nodes = canopen_setups(loaded)
-    return [
-        *(table for each in bus for table in dbc(each, escs)),
-        *(table for each in nodes for table in objects(each, escs)),
-        *emergencies(nodes[0].eds if nodes else None, escs),
-        *values(escs),
-    ]
+        escs = loaded.escs
+        nodes = canopen_setup(loaded)
+        if loaded.database:
+            bus = BusLayout(loaded.database, loaded.layout, escs, loaded.config)
+    found: list[Table] = []
+    if bus is not None:
+        found += dbc(bus, escs)
+    if nodes is not None:
+        found += objects(nodes, escs)
+    found += emergencies(None if nodes is None else nodes.eds, escs)
+    found += values(escs)
+    return found

@@ -1,4 +1,4 @@
-"""Shared by commands of the desk: recordings, the layout that ``-c`` or ``--dbc`` names, progress, pseudo terminals."""
+"""Functions of several desk commands: recordings, layouts, progress and pseudo terminals."""
 
 import argparse
 import sys
@@ -20,14 +20,18 @@ _Block = TypeVar("_Block", bound=Sized)
 
 
 def given_layout(args: argparse.Namespace) -> BusLayout | None:
-    """The layout that an option names; None where none is given. UserError with every mistake."""
+    """Return the layout of ``-c`` or ``--dbc``. None if neither is given.
+
+    Raises UserError with all mistakes.
+    """
     return bus_layout(args) if args.config or args.dbc else None
 
 
 def bus_layout(args: argparse.Namespace) -> BusLayout:
-    """The layout that an option names, else of the configuration of this folder or machine, else the shipped one.
+    """Return the layout of ``-c`` or ``--dbc``.
 
-    UserError with every mistake.
+    Without these options, the layout of the default configuration is returned, and without a
+    default configuration the shipped one. Raises UserError with all mistakes.
     """
     if args.config is None and args.dbc is None:
         args.config = announced_config()
@@ -36,7 +40,8 @@ def bus_layout(args: argparse.Namespace) -> BusLayout:
     loaded = load_all(args.config)
     if loaded.database is None:
         raise UserError(
-            f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. Give --dbc instead."
+            f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. "
+            "Give --dbc instead."
         )
     return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
 
@@ -48,10 +53,10 @@ OpenInput = Callable[[Path, BusLayout | None], Input]
 def reading(
     path: Path, layout: BusLayout | None, opened_by: OpenInput = open_input
 ) -> Iterator[Input]:
-    """An open recording.
+    """Open a recording.
 
-    SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, unless the recording is a stream: they end
-    it, so that its data so far can be used. ``was_ended`` is true afterwards.
+    SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt. If the recording is a stream they end it
+    instead, so that its data so far can be used. ``was_ended`` is true afterwards.
     """
     stream: Stream | None = None
 
@@ -66,21 +71,22 @@ def reading(
 
 
 def was_ended(recording: Input) -> bool:
-    """True if a signal ended the stream that is this recording."""
+    """Return True if the recording is a stream that was ended by a signal."""
     return recording.stream is not None and recording.stream.is_ended
 
 
 def watched(blocks: Iterable[_Block], name: str, data_on_screen: bool) -> Iterator[_Block]:
-    """The blocks, with the number of their items so far on standard error while they are taken; on no terminal nothing is shown.
+    """Yield the blocks, and show the number of their items on standard error.
 
-    ``data_on_screen``: data is written to standard output, which may be the same terminal.
+    Nothing is shown if standard error is not a terminal. ``data_on_screen``: data is written to
+    standard output, which may be the same terminal.
     """
     if not sys.stderr.isatty() or (data_on_screen and sys.stdout.isatty()):
         yield from blocks
         return
     from rich import console, progress
 
-    columns = "{task.description}", "{task.completed:,}", "after", "{task.elapsed:.0f} s"
+    columns = ("{task.description}", "{task.completed:,}", "after", "{task.elapsed:.0f} s")
     shown = [progress.TextColumn(text, markup=False) for text in columns]
     screen = console.Console(stderr=True)
     with progress.Progress(progress.SpinnerColumn(), *shown, console=screen, transient=True) as bar:
@@ -92,7 +98,10 @@ def watched(blocks: Iterable[_Block], name: str, data_on_screen: bool) -> Iterat
 
 @contextmanager
 def terminals(names: Sequence[str], link: str | None) -> Iterator[list[PtyEsc]]:
-    """A pseudo terminal for each name, printed as "esc1 /dev/pts/5". ``link``: symbolic link, {n} is the number from 1."""
+    """Open a pseudo terminal for each name, and print lines such as "esc1 /dev/pts/5".
+
+    ``link`` is the path of a symbolic link to it. {n} in it is the number, from 1.
+    """
     with ExitStack() as stack:
         opened = []
         for number in range(1, len(names) + 1):

@@ -1,4 +1,7 @@
-"""``doctor``: checks machine and configuration and prints remedies; it changes nothing and sends nothing."""
+"""``doctor``: checks machine and configuration and prints remedies.
+
+It changes nothing and sends nothing.
+"""
 
 import argparse
 import platform
@@ -28,10 +31,14 @@ from kontronik_can_gw.native.load import in_words, make_core
 from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.runtime.can.open_can import check_interface
 
+_GAP = " " * 11
+"""Indentation of the further lines of a finding."""
 OPTIONS = (CONFIG, JSON)
 EPILOG = (
-    "It changes nothing, and sends nothing to the bus or to an ESC, so you can call it while the gateway runs. "
-    "It has the permissions of its user. To check the permissions of the service, run it as the service's user "
+    "It changes nothing, and sends nothing to the bus or to an ESC, so you can call it while the "
+    "gateway runs. "
+    "It has the permissions of its user. To check the permissions of the service, run it as the "
+    "service's user "
     "(sudo -u kontronik-can-gw). Root sees more. "
     "Exit codes: 0 no error, perhaps warnings; 1 errors; 2 the configuration cannot be used."
 )
@@ -57,15 +64,22 @@ def main(args: argparse.Namespace) -> int:
 
 
 def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
-    """All findings, and the exit code. Parts that do not depend on a mistake in the configuration are checked nevertheless."""
+    """Return all findings and the exit code.
+
+    If the configuration has mistakes, the parts that do not depend on them are checked.
+    """
     full = str(path.absolute())
     unit = unit_of(machine, full)
-    about, rest = Findings("Configuration"), Findings("Machine")
-    found, config, code = about.found, None, 0
+    about = Findings("Configuration")
+    rest = Findings("Machine")
+    found = about.found
+    config = None
+    code = 0
     try:
         config = load(path)
-        if unit is not None and config.canopen.store is None:  # as set by systemd
-            config = replace(config, canopen=replace(config.canopen, store=unit.state_folder))
+        if unit is not None and config.canopen.store is None:  # systemd sets the folder
+            canopen = replace(config.canopen, store=unit.state_folder)
+            config = replace(config, canopen=canopen)
         check_interface(config.can)
         _outputs(about, assemble(config))
     except UserError as error:
@@ -83,56 +97,73 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
             found += check_port(machine, esc.name, esc.port, even, reasons.get(esc.name, ""))
         found += check_can(machine, config.can)
     check_service(machine, rest, unit, full)
-    # a Raspberry Pi's own alarm; it affects USB adapters first
-    alarms = [f"/sys/class/hwmon/{name}" for name in machine.names("/sys/class/hwmon")]
-    if any(machine.text(f"{each}/in0_lcrit_alarm") == "1" for each in alarms):
+    if _has_low_voltage(machine):
         rest.say("machine.power", "low")
     versions = {"python": platform.python_version(), "kernel": platform.release()}
     rest.say("machine.versions", "ok", version=__version__, **versions)
     found += rest.found
-    return found, code or int(count(found, "error") > 0)
+    if code == 0 and count(found, "error") > 0:
+        code = 1
+    return found, code
+
+
+def _has_low_voltage(machine: Machine) -> bool:
+    """Return True for a Raspberry Pi's alarm about its supply. USB adapters suffer first."""
+    folder = "/sys/class/hwmon"
+    files = [f"{folder}/{name}/in0_lcrit_alarm" for name in machine.names(folder)]
+    return any(machine.text(file) == "1" for file in files)
 
 
 def _outputs(findings: Findings, loaded: Loaded) -> None:
-    """Which core would run, and warnings."""
+    """Report the core that would run, and warnings."""
     findings.say("config", "ok", file=loaded.config.file)
-    core, why = make_core(loaded.escs, loaded.layout, 0, silent=False)
-    findings.say("config.core", "python" if why else "ok", core=in_words(core.language, why))
+    core, reason = make_core(loaded.escs, loaded.layout, 0, silent=False)
+    case = "python" if reason else "ok"
+    findings.say("config.core", case, core=in_words(core.language, reason))
     for warning in (*loaded.layout.warnings, *loaded.warnings):
         findings.say("config.warning", "any", warning=warning)
 
 
 def _folders(machine: Machine, findings: Findings, config: Config, unit: Unit | None) -> None:
-    """Whether its folders can be filled."""
+    """Check the folders to which the gateway writes."""
     store = parameter_folder(config) if config.canopen.enabled else None
-    status, least = config.statistics_path, config.record.min_free_mb * 1_000_000
-    for what, folder, reserve in (
+    status = config.statistics_path
+    reserve = config.record.min_free_mb * 1_000_000
+    folders = (
         ("stored parameters", store, 0),
-        ("captures", record_folder(config), least),
+        ("captures", record_folder(config), reserve),
         ("statistics", status.parent if status else None, 0),
-    ):
+    )
+    for use, folder, min_free in folders:
         if folder is not None:
             path = folder.absolute()
             own = unit is not None and path.is_relative_to(unit.state_folder)
-            check_folder(machine, findings, what, str(path), own, reserve)
+            check_folder(machine, findings, use, str(path), own, min_free)
 
 
 def _show(findings: Sequence[Finding]) -> None:
     """Print the report in 80 columns. Commands are not wrapped, so that they can be copied."""
-    group, gap = "", " " * 11
+    group = ""
     for finding in findings:
         if finding.group != group:
             group = finding.group
             show(group)
-        for first, text in (
-            (f"  {finding.severity:<9}", finding.text),
-            (f"{gap}-> ", finding.remedy),
-        ):
-            for line in textwrap.wrap(
-                text, 80, initial_indent=first, subsequent_indent=gap, break_on_hyphens=False
-            ):
-                show(line)
+        _show_wrapped(f"  {finding.severity:<9}", finding.text)
+        _show_wrapped(f"{_GAP}-> ", finding.remedy)
         if finding.command:
-            show(f"{gap}$ {finding.command}")
-    numbers = {kind: count(findings, kind) for kind in ("error", "warning", "note")}
-    show(", ".join(f"{n or 'no'} {kind}{'s' * (n != 1)}" for kind, n in numbers.items()))
+            show(f"{_GAP}$ {finding.command}")
+    counts = []
+    for severity in ("error", "warning", "note"):
+        number = count(findings, severity)
+        noun = severity if number == 1 else f"{severity}s"
+        counts.append(f"{number or 'no'} {noun}")
+    show(", ".join(counts))
+
+
+def _show_wrapped(first: str, text: str) -> None:
+    """Print a text after ``first``, with its further lines indented."""
+    lines = textwrap.wrap(
+        text, 80, initial_indent=first, subsequent_indent=_GAP, break_on_hyphens=False
+    )
+    for line in lines:
+        show(line)

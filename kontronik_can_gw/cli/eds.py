@@ -18,13 +18,19 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.status import UNCONFIGURED
 
 _NODE_ID = number_from(1, 127, "node-ID", kind=lambda text: int(text, 0))
-# fmt: off
 OPTIONS = (
-    option("-c --config FILE", "use the EDS and nodes of this configuration (default: gateway.toml, or the shipped EDS)", type=Path),
-    option("--node-id N", "write the DCF of the node with this node-ID: the EDS with the values of the node", type=_NODE_ID),
+    option(
+        "-c --config FILE",
+        "use the EDS and nodes of this configuration (default: gateway.toml, or the shipped EDS)",
+        type=Path,
+    ),
+    option(
+        "--node-id N",
+        "write the DCF of the node with this node-ID: the EDS with the values of the node",
+        type=_NODE_ID,
+    ),
     *OUTPUT,
 )
-# fmt: on
 EPILOG = (
     "Prints an unchanged copy of the EDS in use, or a DCF as defined in CiA 306. "
     "Exit codes: 0 done; 1 the file cannot be written; 2 wrong usage, configuration or EDS."
@@ -32,7 +38,7 @@ EPILOG = (
 _STATES_AND_COMMANDS = frozenset(
     {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, VERIFY, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE}
 )
-"""Objects with momentary state, or with an effect when they are written."""
+"""Objects that show a state, or have an effect when they are written."""
 
 
 def main(args: argparse.Namespace) -> int:
@@ -42,7 +48,8 @@ def main(args: argparse.Namespace) -> int:
         escs = setup.esc_settings([EscSettings()])
     else:
         loaded = load_all(path)
-        setup, escs = canopen_of(loaded), loaded.escs
+        setup = canopen_of(loaded)
+        escs = loaded.escs
     text = setup.eds.data.decode("latin-1")  # keeps all bytes
     if args.node_id is not None:
         text = _dcf(setup, escs, args.node_id, Path(args.output).name)
@@ -55,26 +62,31 @@ def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, name: str) 
     nodes = setup.nodes(escs).nodes
     for node, esc in zip(nodes, escs, strict=True):
         if node.node_id == node_id:
-            if name == "-" or not (name.isascii() and name.isprintable()) or ";" in name:
+            is_valid = name.isascii() and name.isprintable() and ";" not in name
+            if name == "-" or not is_valid:
                 name = f"{Path(setup.eds.name).stem}_{node_id}.dcf"
             bitrate = node.settings.bitrate
             return dcf(setup.eds, node_id, bitrate, _active_values(node), esc.name, name)
     there = [str(node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
-    known = f"There {'is' if len(there) == 1 else 'are'} {', '.join(there)}"
-    raise UserError(
-        f"--node-id {node_id}: no node of the configuration has it. {known if there else 'All wait for LSS'}."
-    )
+    known = "All wait for LSS"
+    if there:
+        verb = "is" if len(there) == 1 else "are"
+        known = f"There {verb} {', '.join(there)}"
+    raise UserError(f"--node-id {node_id}: no node of the configuration has it. {known}.")
 
 
 def _active_values(node: Node) -> dict[tuple[int, int], Value]:
-    """A node's configuration by index and sub-index: every readable value but telemetry, states and commands."""
+    """Return the configuration of a node by index and sub-index.
+
+    It consists of all readable values except telemetry, states and commands.
+    """
     values: dict[tuple[int, int], Value] = {}
     for variable in node.dictionary.variables.values():
-        key = variable.entry.index, variable.entry.sub
+        key = (variable.entry.index, variable.entry.sub)
         if not variable.readable or key in BINDINGS or variable.entry.index in _STATES_AND_COMMANDS:
             continue
         try:
             values[key] = node.dictionary.value(variable, 0)
         except SdoAbort:
-            continue  # nothing there yet
+            continue  # the object has no value yet
     return values

@@ -13,7 +13,6 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.native.export_c import EXAMPLE, exported
 from kontronik_can_gw.native.rows import NotInCore
 
-# fmt: off
 OPTIONS = (
     LAYOUT,
     option("LANGUAGE", "c: C99", choices=("c",)),
@@ -21,7 +20,6 @@ OPTIONS = (
     option("-o --output DIR", "another way to give DIR"),
     option("--force", "replace files that exist, for example of an earlier export"),
 )
-# fmt: on
 EPILOG = """\
 Writes the gateway's core in C (deframer, state of the ESCs, packers, schedule),
 and the tables of the DBC in use as constants. CANopen nodes are not included.
@@ -37,7 +35,7 @@ DBC, or the core in C cannot express a message
 
 
 def main(args: argparse.Namespace) -> int:
-    """Write the folder. UserError for faulty input files, RunError where it cannot be written."""
+    """Write the folder. Raises UserError for faulty input files, RunError if writing fails."""
     folder = Path(output_of(args, "DIR"))
     bus = bus_layout(args)
     silent = bus.config is not None and bus.config.dbc.silent_on_loss
@@ -60,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _write(folder: Path, files: dict[str, str], inputs: Sequence[Path], *, force: bool) -> None:
-    """Write all files, or none if one of them must not be written. The user's example stays."""
+    """Write all files, or no file if one of them must not be written. The user's example stays."""
     own = folder / EXAMPLE
     is_kept = own.exists()
     if is_kept:

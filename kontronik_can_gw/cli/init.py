@@ -7,18 +7,16 @@ from kontronik_can_gw.cli.arguments import FORCE, option
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.output import output_of, write_output
 
-# fmt: off
 OPTIONS = (
     option("FILE", "file to write (default: gateway.toml), or - for standard output", nargs="?"),
     option("-o --output FILE", "another way to give FILE"),
     FORCE,
 )
-# fmt: on
 EPILOG = "Exit codes: 0 written, 1 the file cannot be written, 2 the file exists, or wrong usage."
 
 
 def example() -> str:
-    """The example configuration."""
+    """Return the example configuration."""
     return (Path(__file__).parent.parent / "example.toml").read_text(encoding="utf-8")
 
 

@@ -1,4 +1,7 @@
-"""``metrics``: serves a gateway's statistics for Prometheus, from the status file that the gateway replaces each second."""
+"""``metrics``: serves a gateway's statistics for Prometheus.
+
+They are read from the status file, which the gateway replaces each second.
+"""
 
 import argparse
 import ipaddress
@@ -13,9 +16,9 @@ from kontronik_can_gw.desk.monitor.status import look_at_first, possible_files
 
 
 def _loopback(text: str) -> tuple[str, int]:
-    """A type for argparse: an address of this machine, and a port."""
+    """Return a loopback address and a port. A type for argparse."""
     host, _, port = text.rpartition(":")
-    host = {"localhost": "127.0.0.1"}.get(host, host).strip("[]")
+    host = "127.0.0.1" if host == "localhost" else host.strip("[]")
     try:
         if ipaddress.ip_address(host).is_loopback and 0 <= int(port) <= 65535:
             return host, int(port)
@@ -26,16 +29,22 @@ def _loopback(text: str) -> tuple[str, int]:
     )
 
 
-# fmt: off
 OPTIONS = (
     (
         *CONFIG,
-        option("--file FILE", "status file of the gateway (default: the file of the gateway with this configuration)", type=Path),
+        option(
+            "--file FILE",
+            "status file of the gateway (default: the file of the gateway with this configuration)",
+            type=Path,
+        ),
     ),
-    option("--listen HOST:PORT", "where Prometheus may fetch /metrics, on this machine (default 127.0.0.1:9123)",
-           type=_loopback, default=("127.0.0.1", 9123)),
+    option(
+        "--listen HOST:PORT",
+        "where Prometheus may fetch /metrics, on this machine (default 127.0.0.1:9123)",
+        type=_loopback,
+        default=("127.0.0.1", 9123),
+    ),
 )
-# fmt: on
 EPILOG = "A gateway that does not run is answered with 503: Prometheus's up is 0."
 
 
@@ -44,13 +53,18 @@ def main(args: argparse.Namespace) -> int:
         from kontronik_can_gw.desk.metrics import server_of
     except ImportError:
         raise missing_library("metrics", "metrics") from None
-    config = None if args.file else args.config or announced_config()
-    files = [args.file] if args.file else possible_files(config)
-    if len(files) == 1:  # no other gateway's file can be meant
+    if args.file:
+        config = None
+        files = [args.file]
+    else:
+        config = args.config or announced_config()
+        files = possible_files(config)
+    if len(files) == 1:  # the file of another gateway is not possible
         config = None
     look = partial(look_at_first, files, config=config)
     host, port = args.listen
-    stopped, server = threading.Event(), server_of(look, host, port)
+    stopped = threading.Event()
+    server = server_of(look, host, port)
     with server, stopping_on_signals(stopped.set):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         shown = f"[{host}]" if ":" in host else host

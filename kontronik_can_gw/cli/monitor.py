@@ -1,4 +1,7 @@
-"""``monitor``: a live screen of the ESCs, from the CAN bus by the DBC or from a recording. It never sends anything."""
+"""``monitor``: shows a live screen of the ESCs, from the CAN bus or from a recording.
+
+It never sends anything.
+"""
 
 import argparse
 import contextlib
@@ -21,20 +24,30 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable_json
 
 _ONCE_S = 3.0
-# fmt: off
 OPTIONS = (
     option("SOURCE", "a CAN interface, a recording, or - for standard input", nargs="?"),
     LAYOUT,
     option("--interface NAME", "python-can interface (default socketcan)"),
-    option("--channel NAME", "channel of the interface (default can0), or the channel of a CAN log to play, for example can0 or 1"),
-    option("--speed FACTOR", "factor that speeds up a recording, 0.01 to 1000 (default 1)", type=number_from(0.01, 1000, "factor")),
+    option(
+        "--channel NAME",
+        "channel of the interface (default can0), or the channel of a CAN log to play, for "
+        "example can0 or 1",
+    ),
+    option(
+        "--speed FACTOR",
+        "factor that speeds up a recording, 0.01 to 1000 (default 1)",
+        type=number_from(0.01, 1000, "factor"),
+    ),
     (
         option("--once", "print one line of JSON with all values, then end"),
         option("--stream", "print one line of JSON each second until the end"),
     ),
-    option("--timeout S", f"with --once: longest time to wait, in seconds (default {_ONCE_S:g})", type=number_from(0.1, 3600)),
+    option(
+        "--timeout S",
+        f"with --once: longest time to wait, in seconds (default {_ONCE_S:g})",
+        type=number_from(0.1, 3600),
+    ),
 )
-# fmt: on
 EPILOG = """\
 The monitor listens on a CAN interface anywhere on the bus. It needs only the
 DBC (-c, --dbc) and never sends a frame. SOURCE is the name of an interface,
@@ -94,9 +107,9 @@ def _print_document(document: dict[str, Any]) -> None:
 
 
 def _recording_of(args: argparse.Namespace) -> Path | None:
-    """The recording that SOURCE names. Otherwise SOURCE is stored as the channel.
+    """Return the recording of SOURCE. If SOURCE is an interface, store it as the channel.
 
-    UserError for options that contradict SOURCE.
+    Raises UserError for options that contradict SOURCE.
     """
     name = args.source
     if name is None or _is_interface(name, args.interface):
@@ -112,10 +125,11 @@ def _recording_of(args: argparse.Namespace) -> Path | None:
 
 
 def _is_interface(name: str, kind: str | None) -> bool:
-    """Whether a name is a CAN interface's, not a recording's. ``kind``: python-can's interface, if given.
+    """Return True for the name of a CAN interface, False for a recording.
 
-    A name that is neither is an interface unless it looks like a file's: the interface may be
-    missing, and the error says how to make it.
+    ``kind`` is python-can's interface, if it is given. The name of a missing interface or file
+    counts as an interface, unless it looks like a file name. The later error describes how to
+    create the interface.
     """
     if kind not in (None, "socketcan"):
         return not Path(name).is_file()
@@ -144,7 +158,6 @@ def _source_of(args: argparse.Namespace, recording: Path | None) -> Iterator[Sou
             opened.select_channel(args.channel)
         with closing(Recording(opened, args.speed or 1.0, at_once=args.once)) as played:
             yield played
-        for line in dict.fromkeys(
-            filter(None, [*opened.damage, *opened.clock_notes, opened.left_out])
-        ):
+        lines = [*opened.damage, *opened.clock_notes, opened.left_out]
+        for line in dict.fromkeys(filter(None, lines)):
             say(f"warning: {line}")

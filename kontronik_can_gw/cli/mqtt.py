@@ -1,4 +1,7 @@
-"""``mqtt``: publishes the values in the gateway's frames to an MQTT broker. It listens to the bus and sends nothing on it."""
+"""``mqtt``: publishes the values in the gateway's frames to an MQTT broker.
+
+It listens to the bus and sends nothing on it.
+"""
 
 import argparse
 import logging
@@ -33,28 +36,33 @@ log = logging.getLogger("kontronik_can_gw")
 
 _STOP_S = 0.3
 _TURN_S = 0.02
-"""Time between two turns: delay of what is due, and of a signal."""
+"""Time between two turns. Messages and signals are delayed by at most this time."""
 _FILES = {
     "ca_file": "tls",
     "cert_file": "tls",
     "key_file": "cert_file",
     "password_file": "username",
 }
-"""Keys of [mqtt] that are files, and the key without which each means nothing."""
-# fmt: off
+"""Keys of [mqtt] that are files, and the key that each of them needs."""
 OPTIONS = (
     option("FILE", argparse.SUPPRESS, nargs="?"),
     LAYOUT,
     option("--interface NAME", "python-can interface (default: can.interface, socketcan)"),
     option("--channel NAME", "channel of the interface (default: can.channel, can0)"),
-    option("--broker HOST[:PORT]", "the MQTT broker (default: mqtt.broker; port 1883, with mqtt.tls 8883)"),
+    option(
+        "--broker HOST[:PORT]",
+        "the MQTT broker (default: mqtt.broker; port 1883, with mqtt.tls 8883)",
+    ),
 )
-# fmt: on
 EPILOG = (
-    "Set topics, rate, TLS, user and Home Assistant's discovery in the table [mqtt] of the configuration (-c, or gateway.toml). "
-    "If the broker is missing, lost or refuses the connection, this is reported once, and mqtt retries until it is connected. "
-    "SIGTERM and SIGINT publish 'offline' and end mqtt within half a second. If link_state has its own message on the bus, it "
-    "can still be Lost for up to one cycle of that message after a gap, while available is already true."
+    "Set topics, rate, TLS, user and Home Assistant's discovery in the table [mqtt] of the "
+    "configuration (-c, or gateway.toml). "
+    "If the broker is missing, lost or refuses the connection, this is reported once, and mqtt "
+    "retries until it is connected. "
+    "SIGTERM and SIGINT publish 'offline' and end mqtt within half a second. "
+    "If link_state has its own message on the bus, it "
+    "can still be Lost for up to one cycle of that message after a gap, while available is "
+    "already true."
 )
 
 
@@ -65,8 +73,10 @@ def main(args: argparse.Namespace) -> int:
         raise missing_library("MQTT", "mqtt") from None
     if args.file is not None:
         raise UserError(
-            f"{args.file}: recordings are not published any more. Type kontronik-can-gw replay {args.file} --on can --channel vcan0 "
-            f"(a CAN log: canplayer -I {args.file} vcan0=can0), and beside it kontronik-can-gw mqtt --channel vcan0 --broker HOST."
+            f"{args.file}: recordings are not published any more. "
+            f"Type kontronik-can-gw replay {args.file} --on can --channel vcan0 "
+            f"(a CAN log: canplayer -I {args.file} vcan0=can0), and beside it kontronik-can-gw "
+            "mqtt --channel vcan0 --broker HOST."
         )
     with logging_to_stderr():
         bus = bus_layout(args)
@@ -85,34 +95,42 @@ def main(args: argparse.Namespace) -> int:
 
 
 def host_name() -> str:
-    """The host name without its domain, made valid for a topic."""
-    name = re.sub(r"[^A-Za-z0-9_-]+", "-", socket.gethostname().partition(".")[0]).strip("-")
+    """Return the host name without its domain, changed so that it is valid in a topic."""
+    name = socket.gethostname().partition(".")[0]
+    name = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")
     return name[:64] or "gateway"
 
 
 def _settings(broker: str | None, config: Config | None) -> MqttConfig:
-    """The [mqtt] table with absolute file names. UserError with every mistake in it."""
+    """Return the table [mqtt] with absolute file names. Raises UserError with all its mistakes."""
     table = MqttConfig() if config is None else config.mqtt
-    try:
-        table = table if broker is None else replace(table, broker=BROKER.check(broker))
-    except ValueError as error:
-        raise UserError(f"--broker: {error}") from None
+    if broker is not None:
+        try:
+            table = replace(table, broker=BROKER.check(broker))
+        except ValueError as error:
+            raise UserError(f"--broker: {error}") from None
     if table.broker is None:
         raise UserError("no broker is given: --broker HOST, or mqtt.broker in the configuration")
-    if problems := [
-        f"mqtt.{name}: means nothing without mqtt.{other}"
-        for name, other in _FILES.items()
-        if getattr(table, name) and not getattr(table, other)
-    ]:
-        raise UserError(*problems)
     folder = Path("" if config is None else config.file).parent
-    files: dict[str, Any] = {n: str(folder / f) for n in _FILES if (f := getattr(table, n))}
+    problems = []
+    files: dict[str, Any] = {}
+    for name, needed in _FILES.items():
+        file = getattr(table, name)
+        if not file:
+            continue
+        files[name] = str(folder / file)
+        if not getattr(table, needed):
+            problems.append(f"mqtt.{name}: means nothing without mqtt.{needed}")
+    if problems:
+        raise UserError(*problems)
     return replace(table, **files)
 
 
 def _publish(source: Bus, publisher: Publisher, client: "MqttClient") -> None:
-    """Publish from the bus to the broker, until a signal."""
-    stop, notifier, faults = Event(), Notifier(), FaultLog()
+    """Publish from the bus to the broker until a signal."""
+    stop = Event()
+    notifier = Notifier()
+    faults = FaultLog()
     with stopping_on_signals(stop.set):
         client.start()
         notifier.ready("started")

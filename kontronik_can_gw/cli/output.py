@@ -1,9 +1,10 @@
-"""Output files: the one rule of all commands, and writing by it.
+"""Writes output files. All commands follow these rules:
 
 1. A file that exists is replaced only with ``--force``.
-2. A file that the command reads is never written over, also not through a link or with ``--force``.
-3. A file takes its name when it is complete. If writing fails or a signal ends it, no part of it stays.
-4. A pipe or a device is written to as it stands. ``-`` is standard output.
+2. A file that the command reads is never overwritten, also not through a link or with ``--force``.
+3. A file gets its name when it is complete. If writing fails or a signal ends it, the incomplete
+   file is removed.
+4. A pipe or a device is written to directly. ``-`` is standard output.
 """
 
 import argparse
@@ -23,7 +24,10 @@ from kontronik_can_gw.printable import printable
 
 
 def check_output(output: str, inputs: Iterable[Path], *, force: bool) -> None:
-    """UserError if a file must not be written. ``inputs`` are the files that the command reads."""
+    """Raise UserError if a file must not be written.
+
+    ``inputs`` are the files that the command reads.
+    """
     if not output.strip():
         raise UserError("-o: is empty. Give a file, or - for standard output.")
     if output == "-":
@@ -38,7 +42,8 @@ def check_output(output: str, inputs: Iterable[Path], *, force: bool) -> None:
                         f"{output}: would write over the input {path}. Give another name."
                     )
     try:
-        is_folder, is_file = target.is_dir(), target.is_file()
+        is_folder = target.is_dir()
+        is_file = target.is_file()
     except OSError as error:  # for example: the name is too long
         raise RunError(f"{output}: cannot be written: {error.strerror}.") from None
     if is_folder:
@@ -50,8 +55,8 @@ def check_output(output: str, inputs: Iterable[Path], *, force: bool) -> None:
 def configuration_files(config: Path | None, dbc: Path | None = None) -> list[Path]:
     """Return the files that are read for ``-c`` and ``--dbc``.
 
-    These are the configuration, its DBC and its EDS. Without ``-c``, commands look into the default
-    configuration, even if they then use nothing of it.
+    These are the configuration, its DBC and its EDS. Without ``-c``, commands read the default
+    configuration, even if they then use no part of it.
     """
     found = [] if dbc is None else [dbc]
     if config is None:
@@ -64,20 +69,28 @@ def configuration_files(config: Path | None, dbc: Path | None = None) -> list[Pa
 
 
 def recording_files(path: Path) -> list[Path]:
-    """Return the files that a recording may consist of: a file, a folder of parts, or all files that begin so."""
+    """Return the files of a recording.
+
+    ``path`` is a file, a folder, or the beginning of the names of several files.
+    """
     if is_standard_input(path):
         return [Path("/dev/stdin")]
     with suppress(OSError):  # opening it reports the reason
         if path.is_file():
             return [path]
-        folder, beginning = (path, "") if path.is_dir() else (path.parent, path.name)
-        return [each for each in folder.iterdir() if each.name.startswith(beginning)]
+        if path.is_dir():
+            return list(path.iterdir())
+        return [each for each in path.parent.iterdir() if each.name.startswith(path.name)]
     return []
 
 
 def output_of(args: argparse.Namespace, name: str, default: str | None = None) -> str:
-    """Return the output that ``-o`` or the argument ``name`` gives. UserError for both, or neither without a default."""
-    given = [each for each in (args.output, getattr(args, name.lower())) if each is not None]
+    """Return the output that is given with ``-o`` or as the argument ``name``.
+
+    Raises UserError if both are given, and if there is neither an output nor a default.
+    """
+    outputs = (args.output, getattr(args, name.lower()))
+    given = [output for output in outputs if output is not None]
     if len(given) > 1:
         raise UserError(f"{name} and -o: are two outputs. Give one of them.")
     if not given and default is None:
@@ -89,10 +102,10 @@ def output_of(args: argparse.Namespace, name: str, default: str | None = None) -
 def writing(
     output: str, *, keeps_part: bool = False, handles_signals: bool = True
 ) -> Iterator[Output]:
-    """Write an output. RunError if it cannot be written.
+    """Open an output for writing. Raises RunError if it cannot be written.
 
     ``keeps_part``: if writing fails, OUT.part stays. ``handles_signals``: SIGTERM, SIGINT and
-    SIGHUP raise KeyboardInterrupt; otherwise the caller handles them.
+    SIGHUP raise KeyboardInterrupt. Without it the caller handles them.
     """
     out = Output(None if output == "-" else Path(output))
     out.keeps_part = keeps_part
@@ -108,7 +121,7 @@ def writing(
         where = output
         if output == "-":
             where = "standard output"
-            discard_output()  # or what is buffered is tried again at the end
+            discard_output()  # otherwise Python tries to write the buffer again when it exits
         kept = f" The data so far are in {out.kept_part}." if out.kept_part else ""
         raise RunError(f"{where}: cannot be written: {error.strerror}.{kept}") from None
 
@@ -116,7 +129,10 @@ def writing(
 def write_output(
     output: str, text: str, inputs: Iterable[Path] = (), *, force: bool, encoding: str = "utf-8"
 ) -> None:
-    """Write text to a file and report that, or to standard output for ``-``. Line ends stay as they are."""
+    """Write text to a file and report that, or to standard output for ``-``.
+
+    Line ends are not changed.
+    """
     check_output(output, inputs, force=force)
     if output == "-":
         shown = printable(text, keep="\r\n\t") if sys.stdout.isatty() else text

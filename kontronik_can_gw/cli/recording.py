@@ -1,4 +1,4 @@
-"""Makes a gateway that is recorded, from its configuration."""
+"""Makes a gateway with a recorder from a configuration."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ _STATE = "state"
 
 
 def record_folder(config: Config, given: Path | None = None) -> Path | None:
-    """The folder of captures, from the command line or the configuration; None: nothing is recorded."""
+    """Return the folder of captures, which is ``given`` or configured. None: no recording."""
     if given is not None or config.record.directory is None:
         return given
     if config.record.directory == _STATE:
@@ -24,16 +24,21 @@ def record_folder(config: Config, given: Path | None = None) -> Path | None:
 
 
 def in_words(config: Config, folder: Path) -> str:
-    """Folder and limits of the captures, in a line."""
+    """Describe folder and limits of the captures in a line."""
     record = config.record
     words = f"{folder}, parts of {record.part_mb} MB or {record.part_minutes} min"
-    return words + (f", {record.keep_mb} MB in all" if record.keep_mb else "")
+    if record.keep_mb:
+        words += f", {record.keep_mb} MB in all"
+    return words
 
 
 def recorded(
     loaded: Loaded, given: Path | None, now: int, silent: bool
 ) -> tuple[Gateway, Recorder]:
-    """The gateway of a configuration, and what records it in the folder that is given or configured."""
+    """Return the gateway of a configuration and its recorder.
+
+    The folder of the captures is ``given`` or configured.
+    """
     folder = record_folder(loaded.config, given)
     assert folder is not None
     recorder = Recorder(folder, loaded.config.record)
@@ -49,7 +54,7 @@ def recorded(
 
 
 def setup_of(loaded: Loaded) -> CaptureSetup:
-    """The configuration as stored in the header of a capture."""
+    """Return the configuration as it is stored in the header of a capture."""
     config = loaded.config
     dbc = (config.dbc_path.name, loaded.dbc) if config.dbc.enabled else None
     return CaptureSetup(

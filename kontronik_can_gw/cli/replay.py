@@ -26,26 +26,49 @@ from kontronik_can_gw.times import SECOND
 _DRAIN_S = 0.2
 """Time for a gateway to read the last bytes before the terminals are closed."""
 _BUSY_S = 0.0005
+"""Pause before a frame is sent again while the queue is full."""
 _MAX_BUSY_S = 5
+"""Longest time for which the queue may stay full."""
 
 
 def _speed(text: str) -> float | None:
-    return None if text == "max" else number_from(0.01, 1000, "factor, and not max")(text)
+    if text == "max":
+        return None
+    return number_from(0.01, 1000, "factor, and not max")(text)
 
 
-# fmt: off
 OPTIONS = (
     option("FILE", "the recording, or - for standard input", type=Path),
-    option("--on", "target: a CAN bus, or a pseudo terminal for each ESC", choices=("can", "pty"), required=True),
+    option(
+        "--on",
+        "target: a CAN bus, or a pseudo terminal for each ESC",
+        choices=("can", "pty"),
+        required=True,
+    ),
     LAYOUT,
-    option("--speed FACTOR", "speed relative to real time, 0.01 to 1000, or max for the greatest (default 1)", type=_speed, default=1.0),
+    option(
+        "--speed FACTOR",
+        "speed relative to real time, 0.01 to 1000, or max for the greatest (default 1)",
+        type=_speed,
+        default=1.0,
+    ),
     option("--interface NAME", "--on can: python-can interface (default socketcan)"),
-    option("--channel NAME", "--on can: channel of the interface, for example vcan0 (default: can.channel of -c)"),
+    option(
+        "--channel NAME",
+        "--on can: channel of the interface, for example vcan0 (default: can.channel of -c)",
+    ),
     option("--unmarked", "--on can: do not mark the frames as replay"),
-    option("--link PATH", "--on pty: symbolic link to the terminal; {n} is the number of the ESC, from 1"),
-    option("--delay S", "--on pty: seconds for a gateway to open the terminals (default 1)", type=number_from(0, 3600), default=1.0),
+    option(
+        "--link PATH",
+        "--on pty: symbolic link to the terminal; {n} is the number of the ESC, from 1",
+    ),
+    option(
+        "--delay S",
+        "--on pty: seconds for a gateway to open the terminals (default 1)",
+        type=number_from(0, 3600),
+        default=1.0,
+    ),
 )
-# fmt: on
 _ONLY_FOR = {"can": ("interface", "channel", "unmarked"), "pty": ("link",)}
 EPILOG = """\
 FILE is a capture (.kcap; a folder or a common prefix of file names stands for
@@ -73,25 +96,35 @@ be opened or is not a recording
 
 
 class Pace:
-    """Recorded time against real time. ``speed``: recorded seconds in a real one; None: as fast as possible."""
+    """The relation of recorded time and real time.
+
+    ``speed`` is the number of recorded seconds in a real second. None: as fast as possible.
+    """
 
     def __init__(self, speed: float | None) -> None:
         self.speed = speed
         self.latest_ns = 0
-        """The most that anything came too late."""
+        """Greatest delay so far."""
         self.stopped = Event()
         self._origin: tuple[int, int] | None = None
+        """Real time and recorded time of the first call of ``wait``."""
 
     def wait(self, time_ns: int) -> bool:
-        """Pause until a recorded time is due; the first call sets what time it is now. False: stopped."""
+        """Pause until a recorded time is due. The first call does not pause.
+
+        Returns False if the replay was stopped.
+        """
         if self.speed is not None:
             now = time.monotonic_ns()
-            begun, first_ns = self._origin = self._origin or (now, time_ns)
-            late = now - begun - int((time_ns - first_ns) / self.speed)
-            if late < 0:
-                self.stopped.wait(-late / SECOND)
-                late += time.monotonic_ns() - now
-            self.latest_ns = max(self.latest_ns, late)
+            if self._origin is None:
+                self._origin = (now, time_ns)
+            begin_ns, first_ns = self._origin
+            due_ns = begin_ns + int((time_ns - first_ns) / self.speed)
+            late_ns = now - due_ns
+            if late_ns < 0:
+                self.stopped.wait(-late_ns / SECOND)
+                late_ns += time.monotonic_ns() - now
+            self.latest_ns = max(self.latest_ns, late_ns)
         return not self.stopped.is_set()
 
 
@@ -108,7 +141,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _play(args: argparse.Namespace, recording: Input, pace: Pace) -> None:
-    """Play all of it, or until a signal. UserError for a log of CAN frames."""
+    """Play a recording to its end or until a signal. Raises UserError for a log of CAN frames."""
 
     def stop() -> None:
         pace.stopped.set()
@@ -118,14 +151,17 @@ def _play(args: argparse.Namespace, recording: Input, pace: Pace) -> None:
     with stopping_on_signals(stop):
         if not isinstance(recording, PlayedInput):
             raise UserError(
-                f"{name_of(args.file)}: is a log of CAN frames, which has no bytes of ESCs. Type canplayer -I FILE (of can-utils) to send "
-                "a candump log; kontronik-can-gw convert makes one of other logs."
+                f"{name_of(args.file)}: is a log of CAN frames, which has no bytes of ESCs. "
+                "Type canplayer -I FILE (of can-utils) to send a candump log; "
+                "kontronik-can-gw convert makes one of other logs."
             )
         play = {"can": _on_can, "pty": _on_pty}[args.on]
         text = play(args, recording, pace)
         if "times" in recording.provenance:
             text += f"; times are {recording.provenance['times']}"
-        say(f"{text}{', stopped' if pace.stopped.is_set() else ''}")
+        if pace.stopped.is_set():
+            text += ", stopped"
+        say(text)
         for line in recording.damage:
             say(f"warning: {line}")
 
@@ -155,7 +191,10 @@ def _on_can(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str
 
 
 def _bus(args: argparse.Namespace, recording: PlayedInput, fd: bool) -> CanConfig:
-    """The interface of the options, else of the configuration. UserError where none is named."""
+    """Return the interface of the options or the configuration.
+
+    Raises UserError if there is none.
+    """
     if args.config and recording.bus.config:
         return replace(can_config(recording.bus, args.interface, args.channel), fd=fd)
     if args.channel is None:
@@ -166,14 +205,20 @@ def _bus(args: argparse.Namespace, recording: PlayedInput, fd: bool) -> CanConfi
 
 
 def _hold(locks: Locks, channel: str, recording: PlayedInput) -> None:
-    """Lock messages and nodes against a gateway that sends the same. RunError where one does."""
+    """Lock the messages and nodes, so that no gateway can send the same ones.
+
+    Raises RunError if a gateway sends them already.
+    """
     gateway = recording.setup.gateway(recording.sent_layout, recording.created_ns)
     for taken in locks.hold(names_of(gateway, channel)):
         raise in_use(taken)
 
 
 def _send(port: CanPort, frame: CanFrame, channel: str, pace: Pace) -> None:
-    """Send one frame; wait while the queue is full. RunError where the bus accepts no frames any more."""
+    """Send one frame. Wait while the queue is full.
+
+    Raises RunError if the bus accepts no frames for ``_MAX_BUSY_S``, or the interface is down.
+    """
     since = time.monotonic()
     while (answer := port.send(frame)) is not Sent.OK:
         if answer in (Sent.DOWN, Sent.GONE):
@@ -182,7 +227,8 @@ def _send(port: CanPort, frame: CanFrame, channel: str, pace: Pace) -> None:
             return
         if time.monotonic() - since > _MAX_BUSY_S:
             raise RunError(
-                f"CAN {channel}: no frame can be sent for {_MAX_BUSY_S} s: nobody acknowledges, or the bus is full."
+                f"CAN {channel}: no frame can be sent for {_MAX_BUSY_S} s: "
+                "nobody acknowledges, or the bus is full."
             )
         time.sleep(_BUSY_S)
 
@@ -203,9 +249,11 @@ def _on_pty(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str
         pace.stopped.wait(_DRAIN_S)
         for terminal in opened:
             terminal.check()
-    if received := [n for n, terminal in zip(names, opened, strict=True) if terminal.received]:
+    received = [name for name, each in zip(names, opened, strict=True) if each.received]
+    if received:
         raise RunError(
-            f"{', '.join(received)}: the gateway transmits to the ESC, which could take it for a command"
+            f"{', '.join(received)}: the gateway transmits to the ESC, "
+            "which could take it for a command"
         )
     dropped = sum(terminal.dropped_bytes for terminal in opened)
     lost = f", {dropped} of them dropped (nobody read)" if dropped else ""

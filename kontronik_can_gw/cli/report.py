@@ -1,4 +1,4 @@
-"""``report``: writes a recorded flight as one page for a browser."""
+"""``report``: writes a page about a recorded flight for a browser."""
 
 import argparse
 from pathlib import Path
@@ -21,7 +21,6 @@ from kontronik_can_gw.errors import RunError, UserError
 _STOPPED = 130
 """Exit code after a signal."""
 _SECONDS = number_from(0, 1e9)
-# fmt: off
 OPTIONS = (
     option("IN", "capture, CAN log or UART bytes, or - for standard input", dest="input"),
     option("-o --output FILE", "page to write, or - for standard output", required=True),
@@ -31,7 +30,6 @@ OPTIONS = (
     option("--from S", "from this time after the start, in seconds", type=_SECONDS, dest="start"),
     option("--until S", "up to this time after the start, in seconds", type=_SECONDS, dest="end"),
 )
-# fmt: on
 EPILOG = """\
 IN is a capture (.kcap; a folder or a common prefix of file names stands for
 all parts of one run), a file of plain UART bytes, or a CAN log (candump, ASC,
@@ -56,7 +54,10 @@ usage, or IN cannot be opened or is not a recording; 130 stopped by a signal
 
 
 def main(args: argparse.Namespace) -> int:
-    """Report on args.input. UserError for wrong usage, RunError where a file cannot be read or written."""
+    """Write the report of ``args.input``.
+
+    Raises UserError for wrong usage, and RunError if a file cannot be read or written.
+    """
     if args.start is not None and args.end is not None and args.end <= args.start:
         raise UserError(f"--until {args.end:g}: must be greater than --from {args.start:g}")
     source = Path(args.input)
@@ -74,7 +75,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) -> None:
-    """Write the page and report what is damaged or left out. RunError if there is nothing to show."""
+    """Write the page. Report damaged and omitted data.
+
+    Raises RunError if there is nothing to show.
+    """
     source = name_of(Path(args.input))
     flight = _analysed(recording, args)
     damage = [f"{source}: damaged: {line}" for line in recording.damage]
@@ -103,13 +107,14 @@ def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) 
 
 
 def _analysed(recording: Input, args: argparse.Namespace) -> Flight:
-    """The flight of all rows. UserError if nothing could be shown."""
+    """Return the flight after all rows. Raises UserError if nothing can be shown."""
     chosen = needed_columns(recording.fields)
     fields = [recording.fields[index] for index in chosen]
     flight = Flight(recording.bus.escs, fields, window=(args.start, args.end))
     if not flight.has_anything:
         raise UserError(
-            f"{recording.bus.layout.file}: has no signal that a report could show. Give another --dbc."
+            f"{recording.bus.layout.file}: has no signal that a report could show. "
+            "Give another --dbc."
         )
     blocks = filter(len, recording.blocks(chosen))
     for block in watched(blocks, f"{recording.name}: rows", args.output == "-"):

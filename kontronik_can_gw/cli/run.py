@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 log = logging.getLogger("kontronik_can_gw")
 
 _NEVER = (1 << 31) - 1
+"""Threshold of the garbage collector that is never reached."""
 _LOCK_SWITCH_S = 0.0005
-"""Interpreter switch interval: the longest time that the loop waits for another thread of the process."""
+"""The interpreter's switch interval: the longest time that the loop waits for another thread."""
 _PAUSE_S = 5
-"""Pause before the end of a service that cannot start; a signal ends it at once."""
+"""Pause before the exit of a service that cannot start. A signal ends the pause."""
 
 
 def _folder(text: str) -> Path:
@@ -36,15 +37,18 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
-# fmt: off
 OPTIONS = (
     CONFIG,
     option("--wait", "at start, wait for missing ports and interfaces (run.wait_for_devices)"),
-    option("--record DIR", "record all input as captures in this folder (record.directory)", type=_folder),
+    option(
+        "--record DIR",
+        "record all input as captures in this folder (record.directory)",
+        type=_folder,
+    ),
 )
-# fmt: on
 EPILOG = (
-    "SIGTERM, SIGINT and SIGHUP end it within half a second. It reads the configuration only at the start. It only "
+    "SIGTERM, SIGINT and SIGHUP end it within half a second. "
+    "It reads the configuration only at the start. It only "
     "reads from the serial ports and never transmits to an ESC."
 )
 
@@ -65,43 +69,47 @@ def main(args: argparse.Namespace) -> int:
                 log.error("%s", problem)
     if refused is None:
         return 0
-    # the service manager restarts it: not ten times a second for a mistake that a user has to correct
+    # delays the restart by the service manager, because only the user can correct the mistake
     notifier.status(f"cannot start: {refused.problems[0]}")
     time.sleep(_PAUSE_S)
     return refused.exit_code
 
 
 class _Run:
-    """Runs the gateway, from its configuration to its end."""
+    """One run of the gateway, from its configuration to its end."""
 
     def __init__(self, args: argparse.Namespace, notifier: "Notifier") -> None:
-        self._args, self._notifier = args, notifier
+        self._args = args
+        self._notifier = notifier
         self._loop: Loop | None = None
         self._signals: list[str] = []
-        self._stopping = False
+        """Name of the signal that ends the run."""
+        self._is_stopping = False
 
     def main(self) -> None:
-        """Run until a signal ends it."""
+        """Run until a signal ends the gateway."""
         sys.setswitchinterval(_LOCK_SWITCH_S)
         with stopping_on_signals(self._stop) as self._signals:
-            self._loop = loop = self._opened()
-            if self._stopping:  # a signal came before the loop existed
+            loop = self._opened()
+            self._loop = loop
+            if self._is_stopping:  # a signal was received before the loop existed
                 loop.stop(self._reason())
             settle_memory()
             loop.run()
 
     def _stop(self) -> None:
-        self._stopping = True
+        self._is_stopping = True
         self._notifier.stopping()
         if self._loop is not None:
             self._loop.stop(self._reason())
 
     def _reason(self) -> str:
-        """Why the gateway ends."""
-        return f"stopped by {self._signals[0] if self._signals else 'a signal'}"
+        """Return the reason why the gateway ends."""
+        name = self._signals[0] if self._signals else "a signal"
+        return f"stopped by {name}"
 
     def _opened(self) -> "Loop":
-        """The loop with everything open."""
+        """Return the loop with its ports and the CAN interface open."""
         from kontronik_can_gw.native.load import in_words
         from kontronik_can_gw.runtime.loop import Loop
         from kontronik_can_gw.runtime.native_poller import poller_for
@@ -110,10 +118,10 @@ class _Run:
 
         path = config_file(self._args.config)
         program = program_facts(path)
-        # what cantools made of the DBC is not needed any more, and leaves its memory to the core
+        # the objects of cantools are not needed any more, so the core can use their memory
         loaded = replace(load_all(path, _parameter_store), database=None)
         if loaded.outputs:
-            gc.collect()  # the nodes that were built to be checked leave their memory to those that run
+            gc.collect()  # frees the nodes that were built only for the check
         config = loaded.config
         wait = self._args.wait or config.run.wait_for_devices
         _begin_realtime(config.run.realtime_priority, wait)
@@ -136,10 +144,10 @@ class _Run:
             recorder=recorder,
             poller=poller_for(gateway),
         )
-        # first, because a damaged file is moved aside by now and must be reported
-        for esc, why in loaded.damaged:
+        # reported before the ports are opened, because a damaged file was already renamed
+        for esc, reason in loaded.damaged:
             name = loaded.escs[esc].name
-            log.error("%s: stored parameters: %s. Running on defaults.", name, why)
+            log.error("%s: stored parameters: %s. Running on defaults.", name, reason)
         loop.open()
         log.info("%s", in_words(gateway.core.language, gateway.core_note))
         for esc, _ in loaded.damaged:
@@ -147,8 +155,12 @@ class _Run:
         return loop
 
     def _gateway(self, loaded: Loaded) -> "tuple[Gateway, Recorder | None]":
-        """The gateway, and what records it; what only a recorder needs is not loaded without one."""
-        config, now = loaded.config, time.monotonic_ns()
+        """Return the gateway and its recorder.
+
+        Without a recorder, the modules that only a recorder needs are not imported.
+        """
+        config = loaded.config
+        now = time.monotonic_ns()
         silent = config.dbc.silent_on_loss
         if self._args.record is not None or config.record.directory is not None:
             from kontronik_can_gw.cli.recording import recorded
@@ -160,7 +172,10 @@ class _Run:
 
 
 def _begin_realtime(priority: int | None, wait: bool) -> None:
-    """RunError where the priority is not granted, unless ``wait``: then the gateway runs without."""
+    """Set the real-time priority.
+
+    Raises RunError if it is not granted. If ``wait``, the gateway runs without it instead.
+    """
     from kontronik_can_gw.runtime.system import realtime
 
     if priority is None:
@@ -170,7 +185,7 @@ def _begin_realtime(priority: int | None, wait: bool) -> None:
     except RunError as error:
         if not wait:
             raise
-        log.error("%s Running without.", error)  # late frames are better than none
+        log.error("%s Running without.", error)  # late frames are better than no frames
 
 
 def _parameter_store(folder: Path) -> "ParameterStore":
@@ -180,10 +195,12 @@ def _parameter_store(folder: Path) -> "ParameterStore":
 
 
 def settle_memory() -> None:
-    """Give back what the start needed, and freeze all present objects, so that garbage collections never scan them again.
+    """Free memory that only the start needed, and freeze all present objects.
 
-    The hot path makes no reference cycles (tests/runtime/test_garbage.py), so later collections only scan the young generations. Full
-    collections, which free what the interpreter keeps of freed objects, run here and once a minute (runtime/housekeeping.py).
+    Garbage collections never scan frozen objects again. The hot path makes no reference cycles
+    (tests/runtime/test_garbage.py), so later collections scan only the young generations. Full
+    collections also free the memory that the interpreter keeps of freed objects. They run here and
+    once a minute (runtime/housekeeping.py).
     """
     from kontronik_can_gw.native.load import give_back
 

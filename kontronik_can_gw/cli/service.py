@@ -1,11 +1,11 @@
 """``service``: installs the gateway as a systemd service, and removes it.
 
-The files of the package's folder ``service`` are copied as they are, with the path of the program in the units. Without --root it works
-on this machine, as root, and calls systemd's tools; with it only files below that folder are changed.
+The files in the package's folder ``systemd`` are copied. Only the path of the program in the units
+is replaced. Without --root the command changes this machine, as root, and calls systemd's tools.
+With --root only files below that folder are changed.
 """
 
 import argparse
-import itertools
 import os
 import re
 import shutil
@@ -24,23 +24,23 @@ from kontronik_can_gw.errors import RunError, UserError
 
 NAME = "kontronik-can-gw"
 PLAIN = Path(__file__).parents[1] / "systemd"
-"""The files as they are."""
+"""The folder of the original files."""
 _PROGRAM = f"/usr/bin/{NAME}"
-"""The program in them."""
+"""The path of the program in the original units."""
 _KINDS = ("", "-mqtt", "-metrics")
-"""The gateway's service, and those that may stand by it."""
+"""Suffixes of the services: the gateway's, and two optional ones."""
 UNITS = "etc/systemd/system"
 _WANTS = f"{UNITS}/multi-user.target.wants"
 _BOOTED = Path("/run/systemd/system")
-"""Exists where systemd runs (sd_booted)."""
+"""Exists if systemd runs (sd_booted)."""
 _PATIENCE_S = 120
-"""Maximum time of a tool."""
+"""Longest time that a tool may take."""
 _OBSOLETE = (
     f"{UNITS}/{NAME}*.service.d/prometheus.conf",
     f"{UNITS}/{NAME}*@.service.d/instance.conf",
     f"etc/systemd/network/50-{NAME}-*.example",
 )
-"""What earlier versions installed; their set-up of a CAN interface goes on working and stays."""
+"""Files that earlier versions installed. Their set-up of a CAN interface works and is kept."""
 
 
 def _name(text: str) -> str:
@@ -58,33 +58,54 @@ def _program(text: str) -> str:
     return text
 
 
-# fmt: off
-_ROOT = option("--root DIR", "only write files below DIR, for example for a disk image, and call no tools", type=Path)
+_ROOT = option(
+    "--root DIR",
+    "only write files below DIR, for example for a disk image, and call no tools",
+    type=Path,
+)
 OPTIONS = ()
 ACTIONS = {
-    "install": ("write units, udev rules and an example configuration, create the user, enable the service", (
-        _ROOT,
-        option("--instance NAME", "set up one of several gateways, with NAME.toml and kontronik-can-gw@NAME", type=_name),
-        option("--now", "also start or restart the service"),
-        option("--executable PATH", "the program that the service runs (default: this one)", type=_program),
-    )),
-    "uninstall": ("stop and disable all services, and remove the files that install wrote", (_ROOT,)),
+    "install": (
+        "write units, udev rules and an example configuration, create the user, enable the service",
+        (
+            _ROOT,
+            option(
+                "--instance NAME",
+                "set up one of several gateways, with NAME.toml and kontronik-can-gw@NAME",
+                type=_name,
+            ),
+            option("--now", "also start or restart the service"),
+            option(
+                "--executable PATH",
+                "the program that the service runs (default: this one)",
+                type=_program,
+            ),
+        ),
+    ),
+    "uninstall": (
+        "stop and disable all services, and remove the files that install wrote",
+        (_ROOT,),
+    ),
 }
-# fmt: on
 EPILOG = (
-    "Both actions need root, except with --root, and print each step. systemctl shows the state of the services. "
+    "Both actions need root, except with --root, and print each step. "
+    "systemctl shows the state of the services. "
     "Exit codes: 0 done, 1 a step failed, 2 wrong usage."
 )
 
 
 def main(args: argparse.Namespace) -> int:
-    """Do it. RunError or UserError where this machine does not allow it, OSError of a file as RunError."""
+    """Install or uninstall. Raises UserError or RunError if this machine does not allow it.
+
+    An OSError of a file is raised as RunError.
+    """
     root: Path | None = args.root
     if root is not None and not root.is_dir():
         raise UserError(f"{root}: is not a folder. --root names the top folder of a disk image.")
     if root is None and not _BOOTED.is_dir():
         raise RunError(
-            "this system does not run systemd. For a disk image: --root DIR. Without systemd: run --wait"
+            "this system does not run systemd. For a disk image: --root DIR. Without systemd: "
+            "run --wait"
         )
     if root is None and os.geteuid() != 0:
         raise RunError(f"only root may do that: sudo {_own_program()} service {args.action} ...")
@@ -99,13 +120,14 @@ def main(args: argparse.Namespace) -> int:
 
 
 def planned(program: str) -> Iterator[tuple[str, str]]:
-    """Path below the root and text of each file."""
+    """Yield path below the root and text of each file."""
     for kind in _KINDS:
         text = _plain(f"{NAME}{kind}.service").replace(_PROGRAM, program)
         yield f"{UNITS}/{NAME}{kind}.service", text
-        own = text.replace("/gateway.toml", "/%i.toml")  # what an instance has of its own
-        own = re.sub(r"(?m)^(StateDirectory|RuntimeDirectory)=.*", r"\g<0>-%i", own)
-        yield f"{UNITS}/{NAME}{kind}@.service", own
+        # each instance has its own configuration and folders
+        template = text.replace("/gateway.toml", "/%i.toml")
+        template = re.sub(r"(?m)^(StateDirectory|RuntimeDirectory)=.*", r"\g<0>-%i", template)
+        yield f"{UNITS}/{NAME}{kind}@.service", template
     yield f"etc/sysusers.d/{NAME}.conf", _plain("sysusers.conf")
     yield f"etc/tmpfiles.d/{NAME}.conf", _plain("tmpfiles.conf")
     yield f"etc/udev/rules.d/70-{NAME}.rules", _plain("udev.rules")
@@ -119,7 +141,10 @@ def _plain(name: str) -> str:
 
 
 def _install(args: argparse.Namespace, root: Path) -> None:
-    """Write the files, and enable the service if its configuration is usable. RunError where --now cannot start it."""
+    """Write the files, and enable the service if its configuration is usable.
+
+    Raises RunError if --now cannot start it.
+    """
     program = args.executable or _own_program()
     if args.root is None:
         _check_program(program, is_own=args.executable is None)
@@ -128,19 +153,19 @@ def _install(args: argparse.Namespace, root: Path) -> None:
     if not (root / config).exists():
         files[config] = example()
     for place in files:
-        # a link to /etc, as in some roots, would lead to this machine
+        # some roots have absolute links, for example to /etc, which would change this machine
         if not (root / place).parent.resolve().is_relative_to(root.resolve()):
             raise RunError(f"{(root / place).parent}: leads out of {root}")
     for place, text in files.items():
         _put(root / place, text)
-    for path in (path for place in _OBSOLETE for path in root.glob(place)):
+    for path in _obsolete_files(root):
         path.unlink()
         say(f"{path}: removed")
     template = f"{NAME}{'@' if args.instance else ''}.service"
     unit = template.replace("@", f"@{args.instance}")
     lines = _not_ready(root / config)
     is_ready = not lines
-    if is_ready:  # as `systemctl enable` does it
+    if is_ready:  # the following is the effect of `systemctl enable`
         link = root / _WANTS / unit
         link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
@@ -159,7 +184,7 @@ def _install(args: argparse.Namespace, root: Path) -> None:
 
 
 def _put(path: Path, text: str) -> None:
-    """Write a file that all may read; another one of that name is kept beside it, and named."""
+    """Write a file that all users may read. An existing different file is renamed and reported."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
     done = "new"
     if os.path.lexists(path):
@@ -167,7 +192,7 @@ def _put(path: Path, text: str) -> None:
             return
         kept = _set_aside(path)
         done = f"replaced, the one before is {kept}"
-        if path.suffix == ".rules":  # 0.5.0's asked for names of ports in it
+        if path.suffix == ".rules":  # in 0.5.0 users wrote the names of ports into this file
             done += f". Your lines are in {kept}: put them into 71-esc.rules"
     path.write_text(text, encoding="utf-8")
     path.chmod(0o644)
@@ -175,56 +200,84 @@ def _put(path: Path, text: str) -> None:
 
 
 def _set_aside(path: Path) -> str:
-    """Rename a file to the first free name of .bak, .bak2 and so on; the name."""
-    names = (f"{path.name}.bak{number if number > 1 else ''}" for number in itertools.count(1))
-    name = next(name for name in names if not os.path.lexists(path.with_name(name)))
+    """Rename a file with the first free ending of .bak, .bak2 and so on. Return the new name."""
+    name = f"{path.name}.bak"
+    number = 1
+    while os.path.lexists(path.with_name(name)):
+        number += 1
+        name = f"{path.name}.bak{number}"
     path.rename(path.with_name(name))
     return name
 
 
+def _obsolete_files(root: Path) -> list[Path]:
+    found: list[Path] = []
+    for place in _OBSOLETE:
+        found += root.glob(place)
+    return found
+
+
 def _not_ready(config: Path) -> list[str]:
-    """Why the service must not send yet: its configuration is faulty, or the unedited example."""
+    """Return the reasons why the service must not send yet.
+
+    Its configuration is faulty, or it is the unedited example.
+    """
     try:
         ports = {esc.port for esc in load(config).esc}
     except UserError as error:
         return list(error.problems)
-    if ports & {esc.port for esc in parse(tomllib.loads(example()), "").esc}:
+    example_config = parse(tomllib.loads(example()), "")
+    if ports & {esc.port for esc in example_config.esc}:
         return [f"{config}: is the example. Set ports, bit rate and motors first."]
     return []
 
 
 def _own_program() -> str:
-    """Path of the installed program of this Python. UserError where there is none."""
-    for folder in (Path(sysconfig.get_path("scripts")), Path(sys.argv[0]).absolute().parent):
+    """Return the path of this Python's installed program. Raises UserError if there is none."""
+    scripts = Path(sysconfig.get_path("scripts"))
+    for folder in (scripts, Path(sys.argv[0]).absolute().parent):
         if os.access(folder / NAME, os.X_OK):
             return str(folder / NAME)
     raise UserError(f"no installed {NAME} belongs to this Python. Name it with --executable.")
 
 
 def _check_program(program: str, *, is_own: bool) -> None:
-    """UserError where the service's user could not run it. ``is_own``: it is run by this Python, with this package."""
+    """Raise UserError if the service's user cannot run the program.
+
+    ``is_own``: the program uses this Python and this package.
+    """
     paths = [Path(program), Path(program).resolve()]
     if is_own:
         paths += [Path(sys.executable).resolve(), Path(__file__).resolve()]
     for path in paths:
         for part in (*reversed(path.parents), path):
-            mode = part.stat().st_mode & (1 if part.is_dir() else 4) if part.exists() else 0
-            if not mode or str(part) in ("/tmp", "/var/tmp"):  # noqa: S108  it has its own
+            # the service has a /tmp of its own
+            is_temporary = str(part) in ("/tmp", "/var/tmp")  # noqa: S108
+            if is_temporary or not _is_accessible(part):
                 raise UserError(
-                    f"{path}: the service's user cannot reach it: {part}. Install the program where all may read, as in /opt/{NAME}."
+                    f"{path}: the service's user cannot reach it: {part}. "
+                    f"Install the program where all may read, as in /opt/{NAME}."
                 )
+
+
+def _is_accessible(path: Path) -> bool:
+    """Return True if all users may enter a folder or read a file."""
+    if not path.exists():
+        return False
+    needed = 1 if path.is_dir() else 4
+    return bool(path.stat().st_mode & needed)
 
 
 # --- uninstall
 
 
 def _uninstall(root: Path, *, staged: bool) -> None:
-    """Stop, disable and remove. Configurations, stored parameters and the user stay."""
+    """Stop, disable and remove the services. Configurations, parameters and the user are kept."""
     if not staged:
         for verb in ("stop", "reset-failed"):
             _call("systemctl", verb, f"{NAME}*.service")
-    links = [path for path in (root / _WANTS).glob(f"{NAME}*.service") if path.is_symlink()]
-    found = [*links, *(path for place in _OBSOLETE for path in root.glob(place))]
+    found = [path for path in (root / _WANTS).glob(f"{NAME}*.service") if path.is_symlink()]
+    found += _obsolete_files(root)
     for place, text in planned(""):
         path = root / place
         there = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else text
@@ -239,7 +292,8 @@ def _uninstall(root: Path, *, staged: bool) -> None:
         _call("systemctl", "daemon-reload")
     if found:
         say(
-            f"kept: /etc/{NAME}, /var/lib/{NAME}* (sudo rm -r), the user {NAME} (sudo userdel) and /etc/systemd/network"
+            f"kept: /etc/{NAME}, /var/lib/{NAME}* (sudo rm -r), the user {NAME} (sudo userdel) "
+            "and /etc/systemd/network"
         )
     else:
         say("nothing is installed")
@@ -249,31 +303,38 @@ def _uninstall(root: Path, *, staged: bool) -> None:
 
 
 def _reload() -> None:
-    """Let systemd make user and folders, and read units and udev rules."""
-    for words in (
+    """Make systemd create user and folders, and read units and udev rules."""
+    commands = (
         ("systemd-sysusers", f"/etc/sysusers.d/{NAME}.conf"),
         ("systemd-tmpfiles", "--create", f"/etc/tmpfiles.d/{NAME}.conf"),
         ("systemctl", "daemon-reload"),
         ("udevadm", "control", "--reload"),
         ("udevadm", "trigger", "--action=change", "--subsystem-match=tty"),
         ("id", NAME),
-    ):
+    )
+    for words in commands:
         if shutil.which(words[0]):
             _call(*words)
 
 
 def _call(*words: str) -> None:
-    """Call a tool. RunError with its output where it fails."""
+    """Call a tool. Raises RunError with its output if it fails."""
+    command = " ".join(words)
     environment = os.environ | {"LC_ALL": "C.UTF-8"}
     try:
         done = subprocess.run(
-            words, capture_output=True, text=True, errors="replace", timeout=_PATIENCE_S, stdin=subprocess.DEVNULL, env=environment
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        raise RunError(f"`{' '.join(words)}` did not end within {_PATIENCE_S} s") from None
-    except OSError as error:
-        raise RunError(f"`{' '.join(words)}` cannot be started: {error.strerror}") from None
-    if done.returncode:
-        raise RunError(
-            f"`{' '.join(words)}` failed: {' '.join((done.stderr or done.stdout).split())}"
+            words,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_PATIENCE_S,
+            stdin=subprocess.DEVNULL,
+            env=environment,
         )
+    except subprocess.TimeoutExpired:
+        raise RunError(f"`{command}` did not end within {_PATIENCE_S} s") from None
+    except OSError as error:
+        raise RunError(f"`{command}` cannot be started: {error.strerror}") from None
+    if done.returncode:
+        output = " ".join((done.stderr or done.stdout).split())
+        raise RunError(f"`{command}` failed: {output}")

@@ -26,16 +26,16 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 )
 
 _DEVICES = {device.text.lower(): device for device in Device}
-_BITS: dict[str, OperatingError | SelfTestError] = {
-    bit.text: bit for kind in (OperatingError, SelfTestError) for bit in kind
-}
+_BITS: dict[str, OperatingError | SelfTestError] = {}
+_BITS.update({bit.text: bit for bit in OperatingError})
+_BITS.update({bit.text: bit for bit in SelfTestError})
 _UNITS = {"ms": 1e6, "s": 1e9, "": 1e9, "min": 60e9, "h": 3600e9}
 _LONGEST_H = 999_999
 """Longer times do not fit into the 64 bits of a time in ns."""
 
 
 def _time_ns(text: str) -> int:
-    """A TIME in nanoseconds."""
+    """Return a TIME in nanoseconds. A type for argparse."""
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]*)?)\s*(ms|s|min|h|)", text.strip())
     if not match:
         raise ArgumentTypeError(f"{text!r} is not a time. Give for example 5s, 200ms or 2min")
@@ -65,26 +65,53 @@ def _error(text: str) -> ErrorWindow:
     return ErrorWindow(_BITS[key], _time_ns(start), _time_ns(duration) if plus else None)
 
 
-# fmt: off
 OPTIONS = (
     "the ESC",
-    option("--esc N", "number of ESCs, 1..1000 (default 1)", type=number_from(1, 1000, "number of ESCs", kind=int), default=1),
-    option("--device NAME", f"{', '.join(_DEVICES)} (default: kosmik, in the legacy layout jivepro)", choices=tuple(_DEVICES)),
+    option(
+        "--esc N",
+        "number of ESCs, 1..1000 (default 1)",
+        type=number_from(1, 1000, "number of ESCs", kind=int),
+        default=1,
+    ),
+    option(
+        "--device NAME",
+        f"{', '.join(_DEVICES)} (default: kosmik, in the legacy layout jivepro)",
+        choices=tuple(_DEVICES),
+    ),
     option("--layout", "default: legacy for jivepro, else v4", choices=("v4", "legacy")),
     option("--seed N", "seed of all random data (default 0)", type=int, default=0),
     "output and duration",
-    option("--link PATH", "symbolic link to the pseudo terminal; {n} is the number of the ESC, from 1"),
-    option("-o --output --out FILE", "write the bytes to FILE (- for standard output) as fast as possible instead of to a pseudo "
-           "terminal; {n} as in --link"),
+    option(
+        "--link PATH", "symbolic link to the pseudo terminal; {n} is the number of the ESC, from 1"
+    ),
+    option(
+        "-o --output --out FILE",
+        "write the bytes to FILE (- for standard output) as fast as possible instead of to a "
+        "pseudo "
+        "terminal; {n} as in --link",
+    ),
     FORCE,
     option("--seconds TIME", "stop after this time", type=_time_ns),
     "faults",
-    option("--flip-bits SHARE", "share of bits to flip, for example 0.0001", type=number_from(0, 1, "share, as 0.0001"), default=0.0),
-    option("--dropout TIME/TIME", "length and interval of silent periods, for example 2s/10s", type=_dropout),
-    option("--error NAME@TIME[+TIME]", "set an error bit at this time, for a time or until the end; may be repeated",
-           type=_error, action="append", default=[]),
+    option(
+        "--flip-bits SHARE",
+        "share of bits to flip, for example 0.0001",
+        type=number_from(0, 1, "share, as 0.0001"),
+        default=0.0,
+    ),
+    option(
+        "--dropout TIME/TIME",
+        "length and interval of silent periods, for example 2s/10s",
+        type=_dropout,
+    ),
+    option(
+        "--error NAME@TIME[+TIME]",
+        "set an error bit at this time, for a time or until the end; may be repeated",
+        type=_error,
+        action="append",
+        default=[],
+    ),
 )
-# fmt: on
 EPILOG = """\
 Prints a line such as "esc1 /dev/pts/5" for each ESC, then sends until SIGINT,
 SIGTERM or --seconds. The same options and seed give the same bytes. Several
@@ -107,11 +134,15 @@ usage
 
 
 def main(args: argparse.Namespace) -> int:
-    """Simulate. UserError for wrong usage, RunError if a gateway transmitted or a file failed."""
+    """Simulate ESCs.
+
+    Raises UserError for wrong usage, and RunError if a gateway transmitted or a file failed.
+    """
     for name, path in (("--link", args.link), ("-o", args.output)):
         if path is not None and args.esc > 1 and "{n}" not in path:
             raise UserError(
-                f"{name} {path}: needs {{n}} in the path, for the number of each of the {args.esc} ESCs."
+                f"{name} {path}: needs {{n}} in the path, for the number of each of the "
+                f"{args.esc} ESCs."
             )
     if args.output is not None and args.seconds is None:
         raise UserError(f"-o {args.output}: has no end. Give --seconds.")
@@ -123,11 +154,11 @@ def main(args: argparse.Namespace) -> int:
         layout=None if args.layout is None else Layout(args.layout),
         faults=Faults(flipped_bits=args.flip_bits, dropout=args.dropout, errors=tuple(args.error)),
     )
-    # spread over the period, since real ESCs are not synchronized
-    escs = [
-        SimulatedEsc(options, args.seed + index, options.period_ns * index // args.esc)
-        for index in range(args.esc)
-    ]
+    # their starts are spread over the period, because real ESCs are not synchronized
+    escs = []
+    for index in range(args.esc):
+        start_ns = options.period_ns * index // args.esc
+        escs.append(SimulatedEsc(options, args.seed + index, start_ns))
     if args.output is not None:
         _to_files(escs, args.output, args.seconds, force=args.force)
     else:
@@ -136,17 +167,20 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _to_files(escs: list[SimulatedEsc], output: str, time_ns: int, *, force: bool) -> None:
-    names = [output.replace("{n}", str(number)) for number in range(1, len(escs) + 1)]
+    numbers = range(1, len(escs) + 1)
+    names = [output.replace("{n}", str(number)) for number in numbers]
     for name in names:
         check_output(name, (), force=force)
     for number, (esc, name) in enumerate(zip(escs, names, strict=True), 1):
-        total = frames = 0
+        total = 0
+        frames = 0
         with writing(name) as out:
             file = out.open()
-            begin, end = esc.next_ns, esc.next_ns + time_ns
-            while begin < end:  # in steps of a minute, so that a year fits
-                begin = min(begin + 60 * SECOND_NS, end)
-                for sent in esc.frames_until(begin - 1):
+            now = esc.next_ns
+            end = now + time_ns
+            while now < end:  # steps of a minute limit the memory, even for a year
+                now = min(now + 60 * SECOND_NS, end)
+                for sent in esc.frames_until(now - 1):
                     file.write(sent.wire)
                     total += len(sent.wire)
                     frames += 1
@@ -156,7 +190,9 @@ def _to_files(escs: list[SimulatedEsc], output: str, time_ns: int, *, force: boo
 
 def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | None) -> None:
     names = [f"esc{number}" for number in range(1, len(escs) + 1)]
-    stop, guilty = Event(), dict[int, str]()
+    stop = Event()
+    guilty: dict[int, str] = {}
+    """Message about each ESC to which a gateway transmitted."""
     with stopping_on_signals(stop.set), terminals(names, link) as opened:
 
         def complain(index: int) -> None:
@@ -164,7 +200,8 @@ def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | Non
             if index not in guilty:
                 first = opened[index].first_received.hex(" ")
                 guilty[index] = (
-                    f"{names[index]} {opened[index].path}: the gateway transmits to the ESC: {first}"
+                    f"{names[index]} {opened[index].path}: the gateway transmits to the ESC: "
+                    f"{first}"
                 )
                 print(f"ERROR: {guilty[index]}", file=sys.stderr)
 

@@ -1,4 +1,7 @@
-"""``status``: shows the state of running gateways, from the file that each of them replaces every second."""
+"""``status``: shows the state of running gateways.
+
+It is read from their status files, which they replace every second.
+"""
 
 import argparse
 import time
@@ -29,7 +32,6 @@ class NotRunning(RunError):
     exit_code = 3
 
 
-# fmt: off
 OPTIONS = (
     (
         option("-c --config FILE", "show the gateway with this TOML configuration", type=Path),
@@ -37,11 +39,12 @@ OPTIONS = (
     ),
     JSON,
 )
-# fmt: on
 EPILOG = (
     "Without options it shows all gateways of this user and of the system. "
-    "For a live view run: watch kontronik-can-gw status. Exit codes: 0 running and healthy; 1 running, but there is "
-    "no telemetry of an ESC, nothing gets onto the CAN bus, or one of several gateways does not answer; 2 wrong usage; "
+    "For a live view run: watch kontronik-can-gw status. Exit codes: 0 running and healthy; "
+    "1 running, but there is "
+    "no telemetry of an ESC, nothing gets onto the CAN bus, or one of several gateways does not "
+    "answer; 2 wrong usage; "
     "3 no gateway runs, or it has not answered for 3 s."
 )
 
@@ -49,7 +52,8 @@ EPILOG = (
 def main(args: argparse.Namespace) -> int:
     now = time.monotonic_ns()
     seen = _chosen(args, now) or [look_at(file, now) for file in published_files()]
-    if not seen and (config := default_config()) is not None:
+    config = default_config()
+    if not seen and config is not None:
         try:
             seen = [look_at_first(possible_files(config), now, config)]
         except UserError as error:  # a running gateway was not started with this file
@@ -59,11 +63,12 @@ def main(args: argparse.Namespace) -> int:
         print(printable_json({"gateways": [each.as_json() for each in seen]}))
     if not seen:
         raise NotRunning(
-            "no gateway of this user or of the system runs. Start one: kontronik-can-gw run -c FILE, "
+            "no gateway of this user or of the system runs. Start one: "
+            "kontronik-can-gw run -c FILE, "
             f"or as a service: sudo systemctl start {PROGRAM}"
         )
     codes = {each.code for each in seen}
-    # one that has stopped is a fault as long as another one runs
+    # a gateway that has stopped is a fault while another one runs
     code = NOT_RUNNING if codes == {NOT_RUNNING} else min(max(codes), TROUBLE)
     if args.json:
         return code
@@ -71,7 +76,9 @@ def main(args: argparse.Namespace) -> int:
         raise NotRunning(*(each.sentence for each in seen))
     console = Console(highlight=False, soft_wrap=True)
     for number, each in enumerate(seen):
-        for text in ([""] if number else []) + list(lines_of(each)):
+        if number:
+            console.print()
+        for text in lines_of(each):
             console.print(text)
     return code
 

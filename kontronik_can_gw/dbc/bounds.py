@@ -1,15 +1,16 @@
-"""Limits for the numbers in a DBC, checked before cantools reads it: one number must not cost gigabytes or a minute.
+"""Checks the numbers in a DBC before cantools reads it.
 
-cantools makes an object for each page of a multiplexer, builds masks of one character per bit and expands ranges, so the numbers that
-control this are checked first. cantools uses numbers only after it has parsed the whole file, so the patterns need to be exact for
-well-formed text only.
+Without these limits a single number could cost gigabytes of memory or a minute. cantools makes an
+object for each page of a multiplexer, builds masks of one character per bit, and expands ranges. It
+uses numbers only after it has parsed the whole file, so the patterns need to be exact only for
+well-formed text.
 """
 
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from math import prod
 
 from kontronik_can_gw.errors import UserError
@@ -17,10 +18,13 @@ from kontronik_can_gw.errors import UserError
 MAX_BYTES = 8_000_000
 """The largest of 130 real files has 0.8 MB, mostly comments."""
 _MAX_TOKENS = 500_000
-"""The largest real file has 182 000."""
+"""The largest real file has 182 000 words and numbers."""
 _MAX_DIGITS = 400
 _MAX_MESSAGE_BYTES = 4095
-"""ISO 15765-2, of classic frames; SAE J1939's transport protocol has 1785, a CAN FD frame 64."""
+"""The limit of ISO 15765-2 with classic frames.
+
+The limit of SAE J1939's transport protocol is 1785, of a CAN FD frame 64.
+"""
 _MAX_BITS = _MAX_MESSAGE_BYTES * 8
 _MAX_NESTING = 8
 _PAGES = "number of multiplexer values in all"
@@ -40,9 +44,9 @@ _LIMITS = {
     _PAGES: 65_536,
     _TABLES: MAX_BYTES,
 }
-"""The largest number of each kind; the smallest is 0."""
+"""The largest number of each kind. The smallest is 0."""
 _Numbers = Iterator[tuple[str, int, str]]
-"""Kind, number, and where it is: "Msg.Signal: ", or empty."""
+"""Kind, number, and place, which is for example "Msg.Signal: ", or empty."""
 
 STRING = r'"(?:\\"|[^"])*"'
 _TEXT = re.compile(rf"{STRING}|//[^\n]*")
@@ -50,12 +54,13 @@ _TOKEN = re.compile(r"\w+|[^\w\s]")
 _MANY_DIGITS = re.compile(rf"\d[\d_]{{{_MAX_DIGITS}}}")
 _POWER = re.compile(r"(?<![\w.])[\d_.]+[eE][-+]?([\d_]+)")
 _NUMBER_TEXT = re.compile(r'"\s*[-+]?[\d_.]+(?:[eE][-+]?[\d_]+)?\s*"')
-"""cantools also takes a number from an attribute's string."""
+"""cantools also reads a number from the string of an attribute."""
 _INTEGER = re.compile(r"[-+]?\d+")
 _NUMBER = r"([-+]?\d+)"
 _NODE_LIST = re.compile(r"BU_\s*:(?=([\w\s]*))")
 _MESSAGE_OR_SIGNAL = re.compile(
-    rf"BO_\s*{_NUMBER}\s*(\w+)\s*:\s*{_NUMBER}|SG_\s+(\w+)(?:\s+(\w+))?\s*:\s*{_NUMBER}\s*\|\s*{_NUMBER}"
+    rf"BO_\s*{_NUMBER}\s*(\w+)\s*:\s*{_NUMBER}|"
+    rf"SG_\s+(\w+)(?:\s+(\w+))?\s*:\s*{_NUMBER}\s*\|\s*{_NUMBER}"
 )
 _RANGES = re.compile(rf"SG_MUL_VAL_\s*{_NUMBER}\s*(\w+)\s+(\w+)([^;]*)")
 _VALUE_TABLE = re.compile(r"VAL_TABLE_\s+(\w+)([^;]*)")
@@ -64,15 +69,23 @@ _TABLE_NAME = re.compile(r"\s*([A-Za-z_]\w*)\s*\Z")
 
 
 def check_bounds(text: str, path: str) -> None:
-    """UserError with the first number of a DBC that exceeds its limits: where it is, its value, the limits."""
+    """Raise UserError for the first number of a DBC that exceeds its limits.
+
+    The error has the place of the number, its value and the limits.
+    """
     text = _TEXT.sub(_masked, text)
-    if len(text) > _MAX_TOKENS and next(islice(_TOKEN.finditer(text), _MAX_TOKENS, None), None):
+    if len(text) > _MAX_TOKENS:
+        tokens = _TOKEN.finditer(text)
+        if next(islice(tokens, _MAX_TOKENS, None), None):
+            raise UserError(
+                f"{path}: has more than {_MAX_TOKENS} words and numbers. "
+                "Remove messages that are not needed."
+            )
+    found = _MANY_DIGITS.search(text)
+    if found:
         raise UserError(
-            f"{path}: has more than {_MAX_TOKENS} words and numbers. Remove messages that are not needed."
-        )
-    if found := _MANY_DIGITS.search(text):
-        raise UserError(
-            f"{path}: line {_line(text, found)}: a number of more than {_MAX_DIGITS} digits. Correct it."
+            f"{path}: line {_line(text, found)}: a number of more than {_MAX_DIGITS} digits. "
+            "Correct it."
         )
     for kind, number, where in _numbers(text):
         if not 0 <= number <= _LIMITS[kind]:
@@ -82,10 +95,16 @@ def check_bounds(text: str, path: str) -> None:
 
 
 def _masked(found: re.Match[str]) -> str:
-    """A string of the same length without its content (value tables are measured by length), a comment as a blank."""
+    """Return a blank for a comment, and a string without its content.
+
+    The string keeps its length, by which value tables are measured.
+    """
     if found[0].startswith("//"):
         return " "
-    return found[0] if _NUMBER_TEXT.fullmatch(found[0]) else f'"{"_" * (len(found[0]) - 2)}"'
+    if _NUMBER_TEXT.fullmatch(found[0]):
+        return found[0]
+    content = "_" * (len(found[0]) - 2)
+    return f'"{content}"'
 
 
 def _line(text: str, found: re.Match[str]) -> int:
@@ -94,38 +113,48 @@ def _line(text: str, found: re.Match[str]) -> int:
 
 @dataclass
 class _Message:
-    """How a message is multiplexed, by names of signals."""
+    """The multiplexing of a message, by names of signals."""
 
     name: str
     multiplexers: set[str] = field(default_factory=set)
     values: Counter[str] = field(default_factory=Counter)
     """Number of pages of each signal."""
     parents: dict[str, str] = field(default_factory=dict)
-    """Multiplexers that SG_MUL_VAL_ names."""
+    """The multiplexer of a signal in SG_MUL_VAL_."""
     texts: Counter[str] = field(default_factory=Counter)
-    """Sizes of value tables: each text of a multiplexer's table makes a page."""
+    """Sizes of value tables. Each text in a multiplexer's table makes a page."""
 
     def pages(self) -> tuple[int, int]:
-        """Nesting depth of multiplexers, and the total number of pages and signals on pages."""
-        depth = total = 0
+        """Return the nesting depth of multiplexers, and the number of pages and signals on them."""
+        depth = 0
+        total = 0
         for name in self.multiplexers | self.values.keys():
             chain = self._chain(name)
-            made = prod(self.values[each] for each in chain[:-1])
-            total += made * (len(chain) > 1)
+            copies = prod(self.values[each] for each in chain[:-1])
+            if len(chain) > 1:
+                total += copies
             if name in self.multiplexers:
                 depth = max(depth, len(chain))
-                total += made * self.texts[name]
+                total += copies * self.texts[name]
         return depth, total
 
     def _chain(self, name: str) -> list[str]:
-        """A signal and the multiplexers around it, innermost first, as cantools resolves them; one too many at most."""
+        """Return a signal and the multiplexers around it, innermost first, as cantools does.
+
+        The chain is at most one element longer than the limit.
+        """
         chain = [name]
-        while len(chain) <= _MAX_NESTING and (parent := self._parent(chain[-1])) is not None:
+        parent = self._parent(name)
+        while parent is not None and len(chain) <= _MAX_NESTING:
             chain.append(parent)
+            parent = self._parent(parent)
         return chain
 
     def _parent(self, name: str) -> str | None:
-        """A single multiplexer applies to all; among several, SG_MUL_VAL_ decides."""
+        """Return the multiplexer of a signal.
+
+        A single multiplexer applies to all signals. Of several, SG_MUL_VAL_ selects one.
+        """
         if len(self.multiplexers) > 1:
             parent = self.parents.get(name)
             return parent if parent in self.multiplexers else None
@@ -133,34 +162,42 @@ class _Message:
 
 
 def _numbers(text: str) -> _Numbers:
-    """Each number with its kind and its place."""
+    """Yield each number with its kind and its place."""
     for found in _POWER.finditer(text):
-        yield "exponent", int(found[1].replace("_", "") or "0"), f"line {_line(text, found)}: "
+        exponent = found[1].replace("_", "") or "0"
+        yield "exponent", int(exponent), f"line {_line(text, found)}: "
     for found in _NODE_LIST.finditer(text):
         yield "number of nodes", len(found[1].split()), ""
     messages: defaultdict[int, list[_Message]] = defaultdict(list)
-    message, signals, count = _Message(""), 0, 0
+    message = _Message("")
+    signals = 0
+    count = 0
     for found in _MESSAGE_OR_SIGNAL.finditer(text):
         if found[1]:
-            message, signals, count = _Message(found[2]), 0, count + 1
+            message = _Message(found[2])
+            signals = 0
+            count += 1
             messages[int(found[1])].append(message)
             yield "number of messages", count, ""
             yield "CAN id", int(found[1]), f"{message.name}: "
             yield "length in bytes", int(found[3]), f"{message.name}: "
             continue
-        name, mark, signals = found[4], found[5] or "", signals + 1
+        name = found[4]
+        mark = found[5] or ""
+        signals += 1
         yield "number of signals", signals, f"{message.name}: "
         yield "start bit", int(found[6]), f"{message.name}.{name}: "
         yield "length in bits", int(found[7]), f"{message.name}.{name}: "
         if mark.endswith("M"):
             message.multiplexers.add(name)
-        if mark.startswith("m") and (value := _INTEGER.search(mark)):
-            yield _PAGE, int(value[0]), f"{message.name}.{name}: "
+        page = _INTEGER.search(mark)
+        if mark.startswith("m") and page:
+            yield _PAGE, int(page[0]), f"{message.name}.{name}: "
             message.values[name] += 1
     yield from _ranges(text, messages)
     yield from _value_tables(text, messages)
     total = 0
-    for message in (each for same_id in messages.values() for each in same_id):
+    for message in chain.from_iterable(messages.values()):
         nesting, pages = message.pages()
         total += pages
         yield "depth of multiplexers", nesting, f"{message.name}: "
@@ -168,14 +205,20 @@ def _numbers(text: str) -> _Numbers:
 
 
 def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> _Numbers:
-    """Ranges of SG_MUL_VAL_; like cantools, any one character separates the two numbers."""
+    """Yield the numbers in the ranges of SG_MUL_VAL_.
+
+    As in cantools, any single character separates the two numbers of a range.
+    """
     total = 0
     for found in _RANGES.finditer(text):
-        can_id, name, parent = int(found[1]), found[2], found[3]
+        can_id = int(found[1])
+        name = found[2]
+        parent = found[3]
         numbers = _INTEGER.findall(found[4])
         values = 0
         for first, last in zip(numbers[::2], numbers[1::2], strict=False):
-            low, high = int(first), int(last[1:] or "0")
+            low = int(first)
+            high = int(last[1:] or "0")
             yield _PAGE, low, f"SG_MUL_VAL_ of {name}: "
             yield _PAGE, high, f"SG_MUL_VAL_ of {name}: "
             values += max(0, high - low + 1)
@@ -186,15 +229,24 @@ def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> _Numbers:
             message.parents[name] = parent
 
 
+def _count_texts(table: str) -> int:
+    return table.count('"') // 2
+
+
 def _value_tables(text: str, messages: Mapping[int, list[_Message]]) -> _Numbers:
-    """Sizes of value tables; one used by many signals counts once for each."""
-    tables = {
-        found[1]: (len(found[2]), found[2].count('"') // 2) for found in _VALUE_TABLE.finditer(text)
-    }
+    """Yield the sizes of value tables. A table counts once for each signal that uses it."""
+    tables: dict[str, tuple[int, int]] = {}
+    """Length and number of texts of each table."""
+    for found in _VALUE_TABLE.finditer(text):
+        tables[found[1]] = (len(found[2]), _count_texts(found[2]))
     size = 0
     for found in _VALUES.finditer(text):
         named = _TABLE_NAME.match(found[3])
-        length, texts = tables.get(named[1], (0, 0)) if named else (0, found[3].count('"') // 2)
+        if named:
+            length, texts = tables.get(named[1], (0, 0))
+        else:
+            length = 0
+            texts = _count_texts(found[3])
         size += length
         yield _TABLES, size, f"VAL_ of {found[2]}: "
         for message in messages.get(int(found[1]), ()):

@@ -1,4 +1,7 @@
-"""A message of the file as it is sent: as it stands, or for one of several ESCs with its name in front and another id."""
+"""A message of a DBC as it is sent.
+
+It is unchanged, or a copy for one of several ESCs, with the ESC's name as prefix and another id.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,21 +15,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Copy:
-    """A message under its id and names on the bus. It shares all else with the file's."""
+    """A message with its id and names on the bus. All other data are in the file's message."""
 
     message: "Message"
     distance: int = 0
-    """Added to the id."""
+    """Added to the id of the file."""
     esc: int | None = None
-    """Index of the ESC whose name it has; None for a message that is sent once."""
+    """Index of the ESC whose name it has. None for a message that is sent once."""
     prefix: str = ""
 
     @property
     def name(self) -> str:
-        """The prefix takes the place of a leading ``Esc``."""
+        """The message's name on the bus. The prefix replaces a leading ``Esc``."""
         old = self.message.name
         stem = old.removeprefix("Esc")
-        return self.prefix + (stem if self.prefix and stem[:1].isupper() else old)
+        if self.prefix and stem[:1].isupper():
+            return self.prefix + stem
+        return self.prefix + old
 
     @property
     def frame_id(self) -> int:
@@ -38,10 +43,13 @@ class Copy:
         return self.frame_id | (EXTENDED if self.message.is_extended_frame else 0)
 
     def signals(self) -> Iterator[tuple["Signal", str]]:
-        """Signals of the file and their names on the bus."""
+        """Return the signals of the file and their names on the bus."""
         return ((signal, self.prefix + signal.name) for signal in self.message.signals)
 
     def bind_keys(self, signal: str) -> tuple[str, ...]:
-        """What may name a signal of the file in ``[dbc.bind]``: names on the bus come before those in the file."""
+        """Return the keys that a signal of the file may have in ``[dbc.bind]``.
+
+        Names on the bus precede names in the file.
+        """
         sent = self.prefix + signal
         return f"{self.name}.{sent}", sent, f"{self.message.name}.{signal}", signal

@@ -1,4 +1,4 @@
-"""Copies a one-ESC DBC for several ESCs: names prefixed, ids moved, nothing lost."""
+"""Copies a one-ESC DBC for several ESCs without loss: names get prefixes, ids are moved."""
 
 import fnmatch
 from collections.abc import Iterator, Sequence
@@ -18,11 +18,15 @@ if TYPE_CHECKING:
 def copies_of(
     database: "Database", file: str, escs: Sequence[EscSettings], settings: DbcConfig
 ) -> list[Copy]:
-    """The messages of the DBC for these ESCs: ours (those that ``settings`` choose), and those of other nodes as they stand.
+    """Return the messages of a DBC for these ESCs.
 
-    With several ESCs and a DBC whose signals are bound to values of an ESC, and none names which one, each message with such values is
-    there for each ESC: with its name as prefix, its ids moved by ``id_step`` (None: the smallest step without a clash). ``base_id``
-    becomes the lowest of our ids. UserError for names or ids that do not fit.
+    The gateway's messages are those of its node that ``settings`` choose. Messages of other nodes
+    are not changed.
+
+    If there are several ESCs, and no signal of the DBC names an ESC, each message with values of an
+    ESC is copied for each ESC. A copy has the ESC's name as prefix. Its id is moved by ``id_step``,
+    or by the smallest step without a clash if this is None. ``base_id`` becomes the lowest id of
+    the gateway's messages. Raises UserError for names or ids that do not fit.
     """
     node = choose_node(database, settings.node, file, settings.messages)
     messages = _chosen(database, node, settings.messages, file)
@@ -30,39 +34,60 @@ def copies_of(
     shift = 0
     if settings.base_id is not None:
         shift = settings.base_id - min(message.frame_id for message in ours)
-    binder = Binder(escs, settings.bind)
-    values_of = {id(message): binder.escs_of(message) for message in ours if len(escs) > 1}
-    each = {at for at, found in values_of.items() if found}
-    if set().union(*values_of.values()) != {None}:
-        each.clear()
-    ids = [
-        (m.frame_id + shift * (node in m.senders), m.is_extended_frame, id(m) in each)
-        for m in messages
-    ]
-    step = _step(ids, len(escs), settings.id_step, file) if each else 0
+    copied: set[int] = set()
+    if len(escs) > 1:
+        copied = _messages_of_each(ours, Binder(escs, settings.bind))
+    ids = []
+    for message in messages:
+        can_id = message.frame_id
+        if node in message.senders:
+            can_id += shift
+        ids.append((can_id, message.is_extended_frame, id(message) in copied))
+    step = _step(ids, len(escs), settings.id_step, file) if copied else 0
     copies = []
     for message in messages:
         distance = shift if node in message.senders else 0
-        if id(message) not in each:
+        if id(message) not in copied:
             copies.append(Copy(message, distance))
             continue
         for index, esc in enumerate(escs):
-            copies.append(Copy(message, distance + index * step, index, esc_prefix(esc.name)))
-    if problems := [f"{file}: {problem}" for problem in _problems(copies, node)]:
+            prefix = esc_prefix(esc.name)
+            copies.append(Copy(message, distance + index * step, index, prefix))
+    problems = [f"{file}: {problem}" for problem in _problems(copies, node)]
+    if problems:
         raise UserError(*problems)
     return copies
 
 
+def _messages_of_each(messages: Sequence["Message"], binder: Binder) -> set[int]:
+    """Return the object ids of the messages that are copied for each ESC.
+
+    They have values of an ESC that is not named. Empty if a signal names its ESC.
+    """
+    found: set[int] = set()
+    for message in messages:
+        escs = binder.escs_of(message)
+        if escs - {None}:
+            return set()
+        if escs:
+            found.add(id(message))
+    return found
+
+
 def _chosen(database: "Database", node: str, patterns: Sequence[str], file: str) -> list["Message"]:
-    """All messages but those of a node that match none of the patterns, if any. UserError for a pattern without a match."""
+    """Return the messages of other nodes, and those of ``node`` that match one of the patterns.
+
+    Without patterns all messages are returned. Raises UserError for a pattern without a match.
+    """
     if not patterns:
         return list(database.messages)
     ours = {message.name for message in database.messages if node in message.senders}
-    others = {m.name: m for m in database.messages if m.name not in ours}
+    others = {message.name: message for message in database.messages if message.name not in ours}
     chosen: set[str] = set()
     problems = []
     for pattern in patterns:
-        if found := fnmatch.filter(ours, pattern):
+        found = fnmatch.filter(ours, pattern)
+        if found:
             chosen.update(found)
             continue
         hint = did_you_mean(pattern, others if node == NO_NODE else ours)
@@ -71,49 +96,54 @@ def _chosen(database: "Database", node: str, patterns: Sequence[str], file: str)
         problems.append(f"dbc.messages: {pattern!r} is no message of {node} in {file}.{hint}")
     if problems:
         raise UserError(*problems)
-    return [m for m in database.messages if m.name in chosen or m.name not in ours]
+    chosen.update(others)
+    return [message for message in database.messages if message.name in chosen]
 
 
 def _problems(copies: Sequence[Copy], node: str) -> Iterator[str]:
-    """Ids outside the range of CAN ids, and names that become too long with a prefix: a line for all of them."""
-    ours = [made for made in copies if node in made.message.senders]
-    limits = [0x1FFFFFFF if made.message.is_extended_frame else 0x7FF for made in ours]
-    outside = [
-        f"{made.frame_id:X}h"
-        for made, limit in zip(ours, limits, strict=True)
-        if not 0 <= made.frame_id <= limit
-    ]
+    """Yield a line about ids out of range, and a line about names that are too long."""
+    ours = [copy for copy in copies if node in copy.message.senders]
+    outside = []
+    for copy in ours:
+        limit = 0x1FFFFFFF if copy.message.is_extended_frame else 0x7FF
+        if not 0 <= copy.frame_id <= limit:
+            outside.append(f"{copy.frame_id:X}h")
     if outside:
-        what = f"{len(outside)} of {len(ours)} ids are out of range: {listed(outside)}."
-        yield f"{what} Take fewer ESCs or another dbc.base_id."
-    names = [
-        name
-        for made in copies
-        if made.prefix
-        for name in (made.name, *(name for _, name in made.signals()))
-        if len(name) > MAX_NAME
-    ]
-    if names:
-        what = f"longer than {MAX_NAME} characters with the ESC's name in front"
-        yield f"{what}: {listed(names)}. Shorten the name of the ESC, or those in the DBC."
+        problem = f"{len(outside)} of {len(ours)} ids are out of range: {listed(outside)}."
+        yield f"{problem} Take fewer ESCs or another dbc.base_id."
+    names = []
+    for copy in copies:
+        if copy.prefix:
+            names.append(copy.name)
+            names += [name for _, name in copy.signals()]
+    too_long = [name for name in names if len(name) > MAX_NAME]
+    if too_long:
+        problem = f"longer than {MAX_NAME} characters with the ESC's name in front"
+        yield f"{problem}: {listed(too_long)}. Shorten the name of the ESC, or those in the DBC."
 
 
 def _step(ids: Sequence[tuple[int, bool, bool]], count: int, wanted: int | None, file: str) -> int:
-    """The distance of the ids from ESC to ESC: ``wanted``, else the smallest without a clash.
+    """Return the distance of the ids of adjacent ESCs.
 
-    ``ids``: id, whether it has 29 bits, whether it is that of each ESC.
+    This is ``wanted``, or the smallest distance without a clash. ``ids`` contains for each message
+    its id, True if the id has 29 bits, and True if the message is copied for each ESC.
     """
-    taken = {(i, extended) for i, extended, each in ids if not each}
-    own = [(i, extended) for i, extended, each in ids if each]
+    taken = {(can_id, extended) for can_id, extended, is_copied in ids if not is_copied}
+    own = [(can_id, extended) for can_id, extended, is_copied in ids if is_copied]
     widest = max(ids)[0] - min(ids)[0] + 1
-    for step in [wanted] if wanted is not None else range(1, widest + 1):
-        moved = {(i + n * step, extended) for i, extended in own for n in range(count)}
+    steps = range(1, widest + 1) if wanted is None else [wanted]
+    for step in steps:
+        moved: set[tuple[int, bool]] = set()
+        for index in range(count):
+            moved.update((can_id + index * step, extended) for can_id, extended in own)
         if len(moved) == len(own) * count and not taken & moved:
             return step
     if wanted is not None:
         raise UserError(
-            f"{file}: with ids moved by {wanted} an ESC, ids of {count} ESCs clash. Take another step."
+            f"{file}: with ids moved by {wanted} an ESC, ids of {count} ESCs clash. "
+            "Take another step."
         )
     raise UserError(
-        f"{file}: no step moves the ids for {count} ESCs without a clash. Give the messages other ids."
+        f"{file}: no step moves the ids for {count} ESCs without a clash. "
+        "Give the messages other ids."
     )

@@ -1,4 +1,4 @@
-"""Compiles one message of a DBC: its frame, its times, its pages, its signals, its E2E protection."""
+"""Compiles one message of a DBC: frame, timing, pages, signals and E2E protection."""
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from cantools.database.can import Message
 
 _MAX_PAGES = 1024
-"""Maximum of multiplexer values in one of our messages."""
+"""Greatest number of multiplexer values in a message that the gateway sends."""
 _BY_CYCLE = ""
-"""A meaning too: cyclic with a cycle time, else sent with each new value."""
+"""A meaning of send types: cyclic with a cycle time, otherwise sent with each new value."""
 _TABLE = Path(__file__).with_name("send_types.tsv")
 
 
 def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
-    """The plan of a message; None, with lines in the problems, where it cannot be sent."""
+    """Return the plan of a message. None if it cannot be sent, with lines in ``job.problems``."""
     message = copy.message
     where = f"{job.file}: {message.name}"
     before = len(job.problems)
@@ -41,8 +41,12 @@ def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
     if _is_empty(message) or message.length > FD_LENGTHS[-1]:
         return None
     send_type, cycle_ns, delay_ns = _timing(job, message, where)
-    pages = sorted({page for signal in message.signals for page in signal.multiplexer_ids or ()})
-    if problem := _too_many_pages(message, len(pages)):
+    numbers: set[int] = set()
+    for signal in message.signals:
+        numbers.update(signal.multiplexer_ids or ())
+    pages = sorted(numbers)
+    problem = _too_many_pages(message, len(pages))
+    if problem:
         job.problems.append(f"{where}: {problem}")
         return None
     signals = _signals(job, copy)
@@ -79,19 +83,21 @@ def _is_empty(message: "Message") -> bool:
 def _frame_problems(job: Compilation, message: "Message", where: str) -> Iterator[str]:
     if _is_fd(message) and not job.fd_allowed:
         yield (
-            f"{where}: is a CAN FD message ({message.length} bytes). Set can.fd = true, or shorten it."
+            f"{where}: is a CAN FD message ({message.length} bytes). "
+            "Set can.fd = true, or shorten it."
         )
     if _is_fd(message) and message.length not in FD_LENGTHS:
         lengths = ", ".join(map(str, FD_LENGTHS[9:]))
         yield f"{where}: CAN FD has no frames of {message.length} bytes, but {lengths}."
     if _is_empty(message):
         yield (
-            f"{where}: has no signal that could be sent. Give it signals, or leave it out (dbc.messages)."
+            f"{where}: has no signal that could be sent. "
+            "Give it signals, or leave it out (dbc.messages)."
         )
 
 
 def _too_many_pages(message: "Message", count: int) -> str | None:
-    """What is not supported of a message's multiplexing."""
+    """Return the problem of a message whose multiplexing is not supported. None if it is."""
     multiplexers = [signal for signal in message.signals if signal.is_multiplexer]
     if len(multiplexers) > 1 or any(signal.multiplexer_ids for signal in multiplexers):
         return "has more than one level of multiplexing; one is supported."
@@ -101,17 +107,21 @@ def _too_many_pages(message: "Message", count: int) -> str | None:
 
 
 def _signals(job: Compilation, copy: Copy) -> list[SignalPlan]:
-    """The plans of a message's signals, those on several pages once for each."""
+    """Return the plans of a message's signals. A signal on several pages has one for each page."""
     plans = []
     for signal in copy.message.signals:
-        if signal.length <= copy.message.length * 8:  # others are reported with their place
-            compiler = SignalCompiler(job, copy, signal)
-            plans += [compiler.plan(page) for page in signal.multiplexer_ids or (None,)]
-    return [plan for plan in plans if plan is not None]
+        if signal.length > copy.message.length * 8:
+            continue  # reported by _placement_problems
+        compiler = SignalCompiler(job, copy, signal)
+        for page in signal.multiplexer_ids or (None,):
+            plan = compiler.plan(page)
+            if plan is not None:
+                plans.append(plan)
+    return plans
 
 
 def _placement_problems(message: "Message", where: str) -> Iterator[str]:
-    """The first signal outside the message, or that overlaps another one on a page, as cantools finds it."""
+    """Yield the first error of cantools about a signal outside the message, or an overlap."""
     from cantools.database.errors import Error
 
     try:
@@ -123,17 +133,19 @@ def _placement_problems(message: "Message", where: str) -> Iterator[str]:
 def _page_problems(
     message: "Message", pages: Sequence[int], signals: Sequence[SignalPlan], where: str
 ) -> Iterator[str]:
-    """Multiplexer values that do not fit, and signals that have to be on every page."""
+    """Yield problems of multiplexer values that do not fit, and of multiplexed protection."""
     for multiplexer in message.signals:
         if multiplexer.is_multiplexer:
             largest = -1 if multiplexer.is_float else raw_range(multiplexer)[1]
             for page in pages:
                 if page > largest:
-                    yield f"{where}.{multiplexer.name}: cannot hold the multiplexer value {page} (m{page})."
+                    problem = f"cannot hold the multiplexer value {page} (m{page})."
+                    yield f"{where}.{multiplexer.name}: {problem}"
     for signal in signals:
         if signal.page is not None and signal.role in (Role.ALIVE, Role.CRC):
             yield (
-                f"{where}.{signal.name}: is a multiplexed {signal.role.value}; it has to be in every frame. "
+                f"{where}.{signal.name}: is a multiplexed {signal.role.value}; "
+                "it has to be in every frame. "
                 f"Take the m{signal.page} away, or bind it to a constant."
             )
 
@@ -141,7 +153,11 @@ def _page_problems(
 def _crc_problems(
     job: Compilation, copy: Copy, signals: Sequence[SignalPlan], where: str
 ) -> Iterator[str]:
-    """A checksum is sent only as AUTOSAR E2E profile 1, if it is configured or has the well-known names."""
+    """Yield the problems of a checksum, and add a warning if its meaning is assumed.
+
+    A checksum is sent only as AUTOSAR E2E profile 1. It must be configured, or have one of the
+    well-known names.
+    """
     crcs = [signal for signal in signals if signal.role is Role.CRC]
     alive = [signal for signal in signals if signal.role is Role.ALIVE]
     if len(crcs) > 1:
@@ -151,24 +167,32 @@ def _crc_problems(
         return
     (crc,) = crcs
     own = crc.name.removeprefix(copy.prefix)
-    asked = copy.name in job.settings.e2e_data_ids or job.binder.bound(copy, own) is not None
-    fits = len(crc.pieces) == 1 and crc.length == 8 and not crc.pieces[0].at % 8
+    is_bound = job.binder.bound(copy, own) is not None
+    is_configured = is_bound or copy.name in job.settings.e2e_data_ids
+    is_one_byte = len(crc.pieces) == 1 and crc.length == 8
+    fits = is_one_byte and crc.pieces[0].at % 8 == 0
     has_counter = len(alive) == 1 and alive[0].high >= 14
-    counter = alive[0].name.removeprefix(copy.prefix) if alive else ""
-    by_names = has_counter and is_e2e(own, str(job.binder.bound(copy, counter) or counter))
+    has_known_names = False
+    if has_counter:
+        counter = alive[0].name.removeprefix(copy.prefix)
+        counter_source = str(job.binder.bound(copy, counter) or counter)
+        has_known_names = is_e2e(own, counter_source)
     key = f"dbc.e2e_data_ids.{copy.name} = 0x{copy.frame_id & 0xFFFF:X}"
-    if not asked and not (fits and by_names):
+    if not is_configured and not (fits and has_known_names):
         yield (
-            f"{where}.{crc.name}: the DBC does not say how this checksum is made. AUTOSAR E2E profile 1 (8 bits on a byte border, "
-            f"beside exactly one alive counter, 0 to 14) is chosen by {key}. Otherwise bind it to a constant, if receivers take "
+            f"{where}.{crc.name}: the DBC does not say how this checksum is made. "
+            "AUTOSAR E2E profile 1 (8 bits on a byte border, "
+            f"beside exactly one alive counter, 0 to 14) is chosen by {key}. "
+            "Otherwise bind it to a constant, if receivers take "
             "one, or leave the message out (dbc.messages)."
         )
         return
     if not fits:
         yield f"{where}.{crc.name}: an E2E profile 1 CRC needs 8 bits on a byte border."
     if not has_counter:
-        yield f"{where}: {crc.name}: E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
-    if not asked:
+        problem = "E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
+        yield f"{where}: {crc.name}: {problem}"
+    if not is_configured:
         job.warnings.append(
             f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. If that is right, say so: {key}"
         )
@@ -176,7 +200,7 @@ def _crc_problems(
 
 @cache
 def _meanings() -> dict[str, str]:
-    """Meanings by normalized spellings."""
+    """Return the meanings of send types by their normalized spellings."""
     found = {"": _BY_CYCLE}
     for line in _TABLE.read_text(encoding="ascii").splitlines()[1:]:
         name, spellings = line.split("\t")
@@ -185,9 +209,9 @@ def _meanings() -> dict[str, str]:
 
 
 def _timing(job: Compilation, message: "Message", where: str) -> tuple[SendType, int, int]:
-    """Send type, cycle time and minimum distance in ns."""
+    """Return send type, cycle time and minimum distance in ns."""
     cycle = 0
-    # the last two: of what is sent only while something is active; it is sent always
+    # the last two are for messages that are sent only in an active state; here they always are
     for attribute_name in ("GenMsgCycleTime", "GenMsgCycleTimeFast", "GenMsgCycleTimeActive"):
         cycle = cycle or _time(job, message, attribute_name, where)
     delay = _time(job, message, "GenMsgDelayTime", where)
@@ -196,24 +220,27 @@ def _timing(job: Compilation, message: "Message", where: str) -> tuple[SendType,
     name = job.settings.send_type.get(text, _meanings().get(normalize(text)))
     if name is None:
         job.problems.append(
-            f"{where}: GenMsgSendType {text!r} is not known. Say what it means: dbc.send_type.{text!r} = "
+            f"{where}: GenMsgSendType {text!r} is not known. Say what it means: "
+            f"dbc.send_type.{text!r} = "
             f"one of {', '.join(SEND_TYPES)}."
         )
         return SendType.EVENT, cycle, delay
     if name == _BY_CYCLE:
-        return (SendType.CYCLIC if cycle else SendType.EVENT), cycle, delay
+        send_type = SendType.CYCLIC if cycle else SendType.EVENT
+        return send_type, cycle, delay
     send_type = SEND_TYPES[name]
     if SendType.CYCLIC in send_type and not cycle:
         job.problems.append(
-            f'{where}: is sent {text} but its GenMsgCycleTime is 0. Set one in ms, or dbc.send_type.{text!r} = "Event".'
+            f"{where}: is sent {text} but its GenMsgCycleTime is 0. "
+            f'Set one in ms, or dbc.send_type.{text!r} = "Event".'
         )
     return send_type, cycle, delay
 
 
 def _time(job: Compilation, message: "Message", name: str, where: str) -> int:
-    """Returns an attribute in ms as ns, exactly. Returns 0 if it is not set.
+    """Return an attribute in ms as exact ns. 0 if it is not set.
 
-    A value that is no time is a line in the problems, one below a millisecond a warning.
+    Adds a line to the problems for a value that is not a time, and a warning for a time below 1 ms.
     """
     value = attribute(message, name, job.database)
     if value is None or value == "":

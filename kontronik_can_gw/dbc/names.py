@@ -1,4 +1,4 @@
-"""Names in a DBC: how they are compared, which mean a frame counter or a checksum, and the values that others are bound to."""
+"""Finds the meaning of names in a DBC: a frame counter, a checksum, or the value of a signal."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -15,33 +15,41 @@ if TYPE_CHECKING:
     from cantools.database.can import Message
 
 MAX_NAME = 32
-"""Characters that every tool takes."""
+"""Number of characters in a name that every tool supports."""
 
 _E2E = {
     Role.ALIVE: "alive alivecount livecounter messagecounter rollingcounter sequencecounter",
     Role.CRC: "crc crc8 checksum",
 }
-"""Endings that together in a message mean AUTOSAR E2E profile 1 without configuration, as in the first versions."""
+"""Endings that together in a message mean AUTOSAR E2E profile 1 without configuration.
+
+They are the endings that the first versions of the gateway supported.
+"""
 _FURTHER = {
-    Role.ALIVE: "livecnt livecntr alivectr messagecount msgcounter msgcount msgcntr msgcnt msgctr botschaftszaehler "
-    "rollingcount rollingcnt rollcounter rollcnt rollctr sequencecount seqcounter seqcnt seqctr",
+    Role.ALIVE: "livecnt livecntr alivectr messagecount msgcounter msgcount msgcntr msgcnt msgctr "
+    "botschaftszaehler rollingcount rollingcnt rollcounter rollcnt rollctr sequencecount "
+    "seqcounter seqcnt seqctr",
     Role.CRC: "chksum chksm cksum pruefsumme",
 }
 _E2E_ENDINGS = {role: tuple(texts.split()) for role, texts in _E2E.items()}
-_ENDINGS = {role: (*_E2E_ENDINGS[role], *texts.split()) for role, texts in _FURTHER.items()}
+_ENDINGS = {role: _E2E_ENDINGS[role] + tuple(texts.split()) for role, texts in _FURTHER.items()}
 _LAST_WORDS = {Role.ALIVE: {"bz", "sqc"}, Role.CRC: {"cs", "cks", "chk"}}
-"""Too short for endings: they end other words too."""
+"""Words that are too short to be endings, because other words end with them, too."""
 _WHOLE = {"counter", "cntr", "cnt", "ctr"}
-"""Only as a whole name: an ErrorCounter counts no frames."""
+"""Names that mean a frame counter only without a prefix. An ErrorCounter does not count frames."""
 
 
 def esc_prefix(name: str) -> str:
-    """An ESC's name as the beginning of message and signal names: ``left_front`` becomes ``LeftFront``."""
-    return "".join(part[:1].upper() + part[1:] for part in re.split(r"[^A-Za-z0-9]+", name) if part)
+    """Return an ESC's name as the prefix of messages and signals.
+
+    ``left_front`` becomes ``LeftFront``.
+    """
+    parts = re.split(r"[^A-Za-z0-9]+", name)
+    return "".join(part[:1].upper() + part[1:] for part in parts)
 
 
 def protection(name: str) -> Role | None:
-    """ALIVE or CRC where a signal's name or binding means one of them."""
+    """Return ALIVE or CRC if a signal's name or binding has this meaning."""
     letters = normalize(name)
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)
     last = words[-1].casefold() if words else ""
@@ -52,9 +60,10 @@ def protection(name: str) -> Role | None:
 
 
 def is_e2e(crc: str, counter: str) -> bool:
-    """True for a pair of names that means AUTOSAR E2E profile 1."""
-    pairs = ((crc, Role.CRC), (counter, Role.ALIVE))
-    return all(normalize(name).endswith(_E2E_ENDINGS[role]) for name, role in pairs)
+    """Return True for a pair of names that means AUTOSAR E2E profile 1."""
+    if not normalize(crc).endswith(_E2E_ENDINGS[Role.CRC]):
+        return False
+    return normalize(counter).endswith(_E2E_ENDINGS[Role.ALIVE])
 
 
 class Binder:
@@ -64,53 +73,66 @@ class Binder:
         self.escs = escs
         self.bind = bind
         self.used: set[str] = set()
-        self._known = [
-            {normalize(name): value for name, value in values_of_esc(esc).items()} for esc in escs
-        ]
+        """Keys of [dbc.bind] that were found for a signal."""
+        self._known: list[dict[str, Value]] = []
         """Values of each ESC by normalized name."""
-        self._prefixes = sorted(
-            ((normalize(e.name), i) for i, e in enumerate(escs)), key=lambda p: -len(p[0])
-        )
+        for esc in escs:
+            values = values_of_esc(esc)
+            self._known.append({normalize(name): value for name, value in values.items()})
+        self._prefixes = [(normalize(esc.name), index) for index, esc in enumerate(escs)]
+        """Normalized name and index of each ESC, the longest name first."""
+        self._prefixes.sort(key=lambda prefix: -len(prefix[0]))
 
     def by_name(self, name: str, esc: int | None = None) -> tuple[Value, int | None] | None:
-        """The source of a signal name or a bound name, and its ESC (None: no ESC named, or the gateway).
+        """Return the value and the ESC of a signal's name or a bound name.
 
-        ``esc``: whose values a name without an ESC means.
+        The ESC is None if the name does not contain it, and for values of the gateway. ``esc`` is
+        the ESC of a name that does not contain one.
         """
         key = normalize(name)
         if esc is None and len(self.escs) == 1:
             esc = 0
-        meant: list[tuple[int | None, str]] = [] if esc is None else [(esc, key)]
+        candidates: list[tuple[int | None, str]] = []
+        if esc is not None:
+            candidates.append((esc, key))
         for prefix, index in self._prefixes:
             if key.startswith(prefix):
-                meant.append((index, key.removeprefix(prefix)))
-        for of_esc, rest in [*meant, (None, key)]:
-            known = VALUES_BY_KEY if of_esc is None else self._known[of_esc]
+                candidates.append((index, key.removeprefix(prefix)))
+        candidates.append((None, key))
+        for candidate, rest in candidates:
+            known = VALUES_BY_KEY if candidate is None else self._known[candidate]
             value = known.get(rest) or known.get(rest.removesuffix("percent"))
-            if value is not None:
-                return value, None if value.group is Group.GATEWAY else of_esc
+            if value is None:
+                continue
+            if value.group is Group.GATEWAY:
+                return value, None
+            return value, candidate
         return None
 
     def bound(self, copy: Copy, signal: str) -> str | float | None:
-        """The entry of ``[dbc.bind]`` for a signal of the file."""
-        key = next((key for key in copy.bind_keys(signal) if key in self.bind), None)
-        if key is None:
-            return None
-        self.used.add(key)
-        return self.bind[key]
+        """Return the entry of ``[dbc.bind]`` for a signal of the file. None if there is none."""
+        for key in copy.bind_keys(signal):
+            if key in self.bind:
+                self.used.add(key)
+                return self.bind[key]
+        return None
 
     def escs_of(self, message: "Message") -> set[int | None]:
-        """The ESCs that a message has values of, by index; None: of one that is not named."""
+        """Return the ESCs whose values a message contains. None stands for an unnamed ESC."""
         escs = set()
         for signal in message.signals:
             bound = self.bound(Copy(message), signal.name)
-            found = self.by_name(bound if isinstance(bound, str) else signal.name)
-            if found and found[0].group is not Group.GATEWAY:
-                escs.add(found[1])
+            name = bound if isinstance(bound, str) else signal.name
+            found = self.by_name(name)
+            if found is None:
+                continue
+            value, esc = found
+            if value.group is not Group.GATEWAY:
+                escs.add(esc)
         return escs
 
     def suggestions(self, name: str) -> str:
-        """A sentence with the nearest known names, or an empty string."""
+        """Return a sentence with the closest known names, or an empty string."""
         key = normalize(name)
         for prefix, _ in self._prefixes:
             key = key.removeprefix(prefix) or key

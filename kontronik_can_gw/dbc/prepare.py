@@ -1,9 +1,12 @@
-"""From a DBC and the ESCs to what will be sent: the compiled layout.
+"""Compiles a DBC for some ESCs to a layout.
 
-A layout is the tuple of MessagePlans that the configured transmitter node sends. Ids, positions, byte order, sign, factor, offset,
-limits, value tables and timing come only from the file. All mistakes in a DBC or its bindings are found here, at start, at once. What is
-no mistake but hides something is a warning: a bus that is nearly full, flags without a code for "not available" where nothing reports
-lost telemetry, values that a protocol lacks.
+A layout is the tuple of MessagePlans that the configured transmitter node sends. Ids, positions,
+byte order, sign, factor, offset, limits, value tables and timing are taken only from the file. All
+mistakes in a DBC or its bindings are found here together, at the start.
+
+Settings that are valid but misleading cause a warning: a bus that is nearly full, flags without a
+code for "not available" in a message that does not report lost telemetry, and values that a
+protocol does not supply.
 """
 
 from collections import Counter
@@ -28,9 +31,12 @@ from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
-WARN_LOAD, REFUSE_LOAD = 0.5, 1.0
+WARN_LOAD = 0.5
+REFUSE_LOAD = 1.0
 _MANY = 5
+"""If more signals are not bound, the error describes how to send only some messages."""
 _OF_LINK = frozenset({"link_state", "data_age"})
+"""Values that report the loss of live data."""
 
 
 def prepare(
@@ -41,9 +47,10 @@ def prepare(
     fd_allowed: bool = False,
     taken_ids: Mapping[int, str] | None = None,
 ) -> Layout:
-    """The compiled layout of a gateway with these ESCs. UserError with every mistake at once.
+    """Return the compiled layout of a gateway with these ESCs.
 
-    ``taken_ids``: ids and blocks of ids already in use (as COB-IDs of our CANopen nodes), and their users.
+    ``taken_ids`` contains ids and blocks of ids that are already in use, and their users, for
+    example the CANopen nodes with their COB-IDs. Raises UserError with all mistakes together.
     """
     node = choose_node(database, settings.node, file, settings.messages)
     copies = copies_of(database, file, escs, settings)
@@ -54,8 +61,10 @@ def prepare(
     job.problems += _unused_settings(job, ours, node)
     if len(job.unbound) > _MANY:
         job.problems.append(
-            f"{file}: {len(job.unbound)} signals of {node} are bound to nothing. dbc.messages chooses messages, as "
-            f'["{ours[0].message.name}", "Esc*"]; dbc.unbound = "start_value" sends what is not bound as a constant.'
+            f"{file}: {len(job.unbound)} signals of {node} are bound to nothing. "
+            "dbc.messages chooses messages, as "
+            f'["{ours[0].message.name}", "Esc*"]; '
+            'dbc.unbound = "start_value" sends what is not bound as a constant.'
         )
     if job.problems:
         raise UserError(*dict.fromkeys(job.problems))
@@ -64,40 +73,49 @@ def prepare(
 
 
 def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
-    """The plans of our messages, compiled once for ESCs that differ in nothing that signals know of."""
+    """Yield the plans of the gateway's messages.
+
+    A message is compiled only once for ESCs with the same protocol and the same bindings.
+    """
     made: dict[object, tuple[Copy, MessagePlan]] = {}
     for copy in ours:
         key: object = None
         if copy.esc is not None:
             protocol = job.binder.escs[copy.esc].protocol
-            bound = (job.binder.bound(copy, signal.name) for signal in copy.message.signals)
+            bound = [job.binder.bound(copy, signal.name) for signal in copy.message.signals]
             key = (id(copy.message), protocol, *bound)
         if copy.esc is not None and key in made:
-            of, plan = made[key]
+            first, plan = made[key]
             yield replace(
                 plan,
                 name=copy.name,
                 can_id=copy.frame_id,
                 escs=frozenset((copy.esc,)),
                 data_id=job.settings.e2e_data_ids.get(copy.name, copy.frame_id & 0xFFFF),
-                renamed=(of.prefix, copy.prefix),
+                renamed=(first.prefix, copy.prefix),
             )
-        elif (compiled := compile_message(job, copy)) is not None:
+            continue
+        compiled = compile_message(job, copy)
+        if compiled is not None:
             yield compiled
-            # each copy with a CRC has to be asked for by its own name
-            protected = any(signal.role is Role.CRC for signal in compiled.compiled)
-            if compiled.escs == {copy.esc} and not protected:
-                made[key] = copy, compiled
+            # a CRC must be configured with the name of each copy, so its copies may differ
+            is_protected = any(signal.role is Role.CRC for signal in compiled.compiled)
+            if compiled.escs == {copy.esc} and not is_protected:
+                made[key] = (copy, compiled)
 
 
 def _clashes(
     copies: Sequence[Copy], node: str, taken: Mapping[int, str], file: str
 ) -> Iterator[str]:
-    """Ids and names that one of our messages shares with another, names that its signals share, and ids that are taken."""
+    """Yield the problems of ids and names that are used twice, and of ids that are taken.
+
+    Clashes between two messages of other nodes are not problems.
+    """
     ids: dict[int, Copy] = {}
     names: dict[str, Copy] = {}
     for copy in copies:
-        same_id, same_name = ids.setdefault(copy.key, copy), names.setdefault(copy.name, copy)
+        same_id = ids.setdefault(copy.key, copy)
+        same_name = names.setdefault(copy.name, copy)
         senders = copy.message.senders
         if same_id is not copy and node in (*senders, *same_id.message.senders):
             yield (
@@ -109,8 +127,9 @@ def _clashes(
         if node not in senders:
             continue
         counted = Counter(signal.name for signal in copy.message.signals)
-        for name in (name for name, count in counted.items() if count > 1):
-            yield f"{file}: {copy.message.name}.{name}: two signals have this name. Rename one."
+        for name, count in counted.items():
+            if count > 1:
+                yield f"{file}: {copy.message.name}.{name}: two signals have this name. Rename one."
         user = copy.key if copy.key in taken else block_of(copy.key, taken)
         if user is not None:
             yield (
@@ -120,33 +139,38 @@ def _clashes(
 
 
 def _unused_settings(job: Compilation, ours: Sequence[Copy], node: str) -> Iterator[str]:
-    """Entries of the configuration for what is not in our messages."""
-    settings, file = job.settings, job.file
+    """Yield the problems of settings that do not apply to any of the gateway's messages."""
+    settings = job.settings
+    file = job.file
     messages = [copy.message for copy in ours]
-    known = [m.name for m in messages] + [f"{m.name}.{s.name}" for m in messages for s in m.signals]
+    known = [message.name for message in messages]
+    for message in messages:
+        known += [f"{message.name}.{signal.name}" for signal in message.signals]
     for key in sorted(set(settings.bind) - job.binder.used):
         near = did_you_mean(key, known)
         yield f"dbc.bind.{key}: no such signal in the messages of {node} in {file}.{near}"
-    yield from _unmet("units", settings.units, job.units, f"signal of {node} has this unit", file)
-    what = f"message of {node} has this GenMsgSendType"
-    yield from _unmet("send_type", settings.send_type, job.send_types, what, file)
+    condition = f"signal of {node} has this unit"
+    yield from _unmet("units", settings.units, job.units, condition, file)
+    condition = f"message of {node} has this GenMsgSendType"
+    yield from _unmet("send_type", settings.send_type, job.send_types, condition, file)
     for name in sorted(set(settings.e2e_data_ids) - {copy.name for copy in ours}):
         yield f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}."
 
 
 def _unmet(
-    table: str, given: Iterable[str], met: Iterable[str], what: str, file: str
+    table: str, given: Iterable[str], met: Iterable[str], condition: str, file: str
 ) -> Iterator[str]:
     for text in sorted(set(given) - set(met)):
         near = did_you_mean(text, met, 0.3, show=repr)
-        yield f"dbc.{table}.{text}: no {what} in {file}.{near}"
+        yield f"dbc.{table}.{text}: no {condition} in {file}.{near}"
 
 
 def _timing_warnings(job: Compilation, plans: Sequence[MessagePlan]) -> Iterator[str]:
     once = [plan.name for plan in plans if not plan.cycle_ns and not plan.paces]
     if once:
         yield (
-            f"{job.file}: sent once at the start, without a cycle and a value that changes: {listed(once)}"
+            f"{job.file}: sent once at the start, without a cycle and a value that changes: "
+            f"{listed(once)}"
         )
 
 
@@ -157,20 +181,24 @@ def check_load(
     further: Mapping[str, float] | None = None,
     worst_further: Mapping[str, float] | None = None,
 ) -> str | None:
-    """Returns a warning if the worst bus load is above 50 %. UserError if the usual one is above 100 %.
+    """Return a warning if the worst bus load is above 50 %.
 
-    ``further`` and ``worst_further``: other outputs and their bits per second, usual and worst.
+    Raises UserError if the usual load is above 100 %. ``further`` and ``worst_further`` contain the
+    bits per second of other outputs, usual and at worst.
     """
     further = further or {}
     worst_further = worst_further or further
     load = layout.bus_load(bitrate, data_bitrate) + sum(further.values()) / bitrate
     worst = layout.bus_load(bitrate, data_bitrate, is_worst=True)
     worst += sum(worst_further.values()) / bitrate
-    who = [*([f"{layout.file}: the messages"] if layout.messages else []), *further]
-    text = f"{' and '.join(who)} need {load:.0%} of {bitrate // 1000} kbit/s"
+    senders = list(further)
+    if layout.messages:
+        senders.insert(0, f"{layout.file}: the messages")
+    text = f"{' and '.join(senders)} need {load:.0%} of {bitrate // 1000} kbit/s"
     if load > REFUSE_LOAD:
         raise UserError(
-            f"{text}. Send less often (GenMsgCycleTime, GenMsgDelayTime; inhibit times) or raise can.bitrate."
+            f"{text}. Send less often (GenMsgCycleTime, GenMsgDelayTime; "
+            "inhibit times) or raise can.bitrate."
         )
     if worst <= WARN_LOAD:
         return None
@@ -180,16 +208,17 @@ def check_load(
 
 
 def is_mute(signal: SignalPlan) -> bool:
-    """True for a flag that shows one of its two values without telemetry."""
+    """Return True for a flag that has one of its two values without telemetry."""
     source = signal.source
     if source is None or source.bit is None or signal.is_float or not source.supplied:
         return False
-    values = {value * signal.slope + signal.intercept for value in (0, 1)}
-    return source.group in (Group.LIVE, Group.INFO) and signal.not_available in values
+    if source.group not in (Group.LIVE, Group.INFO):
+        return False
+    return signal.not_available in (signal.intercept, signal.slope + signal.intercept)
 
 
 def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
-    """The signal in the same frame as the flag that reports the loss."""
+    """Return the signal in the frame of a flag that reports lost telemetry. None without it."""
     for signal in message.signals:
         source = signal.source
         if source is None or signal.esc != flag.esc or signal.page not in (None, flag.page):
@@ -203,30 +232,43 @@ def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
 
 
 def unreported(layout: Layout, silent: bool) -> list[str]:
-    """A warning for each message whose flags hide the loss of telemetry. ``silent``: ``dbc.on_loss``."""
+    """Return a warning for each message whose flags hide the loss of telemetry.
+
+    ``silent`` is True if ``dbc.on_loss`` is "silent".
+    """
     found = []
     for message in layout.messages:
-        stops = bool(message.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in message.paces
-        flags = [s.name for s in message.signals if is_mute(s) and reporter(message, s) is None]
+        has_telemetry = not message.paces.isdisjoint({Group.LIVE, Group.INFO})
+        stops = has_telemetry and Group.LINK not in message.paces
+        flags = []
+        for signal in message.signals:
+            if is_mute(signal) and reporter(message, signal) is None:
+                flags.append(signal.name)
         if flags and not (silent and stops):
             remedy = ', or set dbc.on_loss = "silent"' if stops else ""
             found.append(
-                f"{layout.file}: {message.name}: without telemetry {listed(flags, 3)} are sent as if they were known, and no signal "
-                f"of the message reports the loss. Add one bound to link_state, or with NotAvailable in its value table{remedy}."
+                f"{layout.file}: {message.name}: without telemetry {listed(flags, 3)} are sent "
+                "as if they were known, and no signal "
+                "of the message reports the loss. Add one bound to link_state, or with "
+                f"NotAvailable in its value table{remedy}."
             )
     return found
 
 
 def unsupplied(layout: Layout, escs: Sequence[EscSettings]) -> list[str]:
-    """A warning for each message with values that the protocol of their ESC does not have."""
+    """Return a warning for each message with values that its ESC's protocol does not have."""
     found = []
     for message in layout.messages:
-        missing = [s for s in message.signals if s.source is not None and not s.source.supplied]
-        if missing:
-            names = listed((signal.name for signal in missing), 3)
-            whose = " or ".join(sorted({escs[signal.esc or 0].protocol for signal in missing}))
+        names = []
+        protocols = set()
+        for signal in message.signals:
+            if signal.source is not None and not signal.source.supplied:
+                names.append(signal.name)
+                protocols.add(escs[signal.esc or 0].protocol)
+        if names:
             found.append(
-                f"{layout.file}: {message.name}: {names}: not supplied by the protocol {whose}, never available. "
+                f"{layout.file}: {message.name}: {listed(names, 3)}: "
+                f"not supplied by the protocol {' or '.join(sorted(protocols))}, never available. "
                 "A flag, which has no code for that, is sent as 0 or its start value."
             )
     return found

@@ -1,4 +1,4 @@
-"""Raw values of a signal: their bits, their range, numbers as they stand in the file, constants, the codes in a value table."""
+"""Raw values of a signal: bits, range, exact numbers of the file, constants, value tables."""
 
 import math
 from fractions import Fraction
@@ -15,10 +15,11 @@ if TYPE_CHECKING:
 
 _NOT_AVAILABLE = frozenset({"notavailable", "sna", "na", "signalnotavailable"})
 _ERROR = frozenset({"error", "err", "invalid"})
+_CODES = _NOT_AVAILABLE | _ERROR
 
 
 class ValueTable:
-    """The value table of a signal: texts of values, codes for "not available" and "error"."""
+    """The value table of a signal: texts of values, and codes for "not available" and "error"."""
 
     def __init__(self, signal: "Signal") -> None:
         self.entries = {int(raw): str(text) for raw, text in (signal.choices or {}).items()}
@@ -26,30 +27,42 @@ class ValueTable:
         """Raw values by normalized text."""
         self.not_available = self._first(_NOT_AVAILABLE)
         self.error = self._first(_ERROR)
-        self.special = [raw for text, raw in self.codes.items() if text in _NOT_AVAILABLE | _ERROR]
-        """Raw values that are codes and no values."""
-        self.texts = {
-            raw: text
-            for raw, text in self.entries.items()
-            if normalize(text) not in _NOT_AVAILABLE | _ERROR
-        }
+        self.special: list[int] = []
+        """Raw values that are codes."""
+        for text, raw in self.codes.items():
+            if text in _CODES:
+                self.special.append(raw)
+        self.texts: dict[int, str] = {}
         """Entries that are values."""
+        for raw, text in self.entries.items():
+            if normalize(text) not in _CODES:
+                self.texts[raw] = text
 
     def numbers(self, value: Value) -> dict[int, int]:
-        """Numbers of an enumeration to the raw values of their texts."""
-        keys = {number: normalize(text) for number, text in value.names.items()}
-        return {number: self.codes[key] for number, key in keys.items() if key in self.codes}
+        """Return the raw value of each number of an enumeration whose text is in the table."""
+        found = {}
+        for number, text in value.names.items():
+            key = normalize(text)
+            if key in self.codes:
+                found[number] = self.codes[key]
+        return found
 
     def _first(self, texts: frozenset[str]) -> int | None:
-        return next((raw for text, raw in self.codes.items() if text in texts), None)
+        for text, raw in self.codes.items():
+            if text in texts:
+                return raw
+        return None
 
 
 @lru_cache(maxsize=1024)
 def pieces(start: int, length: int, byte_order: str) -> tuple[Piece, ...]:
-    """The bits of a signal as runs of adjacent ones; of signals at the same place one and the same object."""
+    """Return the bits of a signal as runs of adjacent bits.
+
+    Signals with the same place share one object.
+    """
     if byte_order == "little_endian":
         return (Piece(0, length, start),)
-    # big-endian: start is the most significant bit, downward within a byte, then the next byte
+    # big-endian: start is the most significant bit; bits continue downward, then in the next byte
     found = []
     while length:
         width = min(length, start % 8 + 1)
@@ -60,40 +73,50 @@ def pieces(start: int, length: int, byte_order: str) -> tuple[Piece, ...]:
 
 
 def raw_range(signal: "Signal") -> tuple[int, int]:
-    """The smallest and the largest whole number in the signal's bits."""
+    """Return the smallest and the largest whole number in the signal's bits."""
     length = signal.length
     if signal.is_signed:
-        return -(1 << length - 1), (1 << length - 1) - 1
+        half = 1 << length - 1
+        return -half, half - 1
     return 0, (1 << length) - 1
 
 
 @lru_cache(maxsize=1024)
 def exact(number: Any) -> Fraction:
-    """The decimal number in the file, not the float nearest to it."""
+    """Return the decimal number in the file, not the nearest float."""
     return Fraction(repr(number)) if isinstance(number, float) else Fraction(number)
 
 
 def text(value: Fraction) -> str:
-    """A number for people."""
+    """Return a number for people."""
     return f"{float(value):.10g}"
 
 
 def constant(signal: "Signal", value: float, factor: Fraction, offset: Fraction) -> int | None:
-    """The raw bits of a constant physical value; None where the signal cannot hold it (floats are rounded)."""
+    """Return the raw bits of a constant physical value. Floats are rounded.
+
+    None if the signal cannot contain the value.
+    """
     if not math.isfinite(value):
         return None
     raw = (exact(value) - offset) / factor
     if signal.is_float:
         return float_bits(raw, signal.length)
     low, high = raw_range(signal)
-    return int(raw) if raw.denominator == 1 and low <= raw <= high else None
+    if raw.denominator != 1 or not low <= raw <= high:
+        return None
+    return int(raw)
 
 
 def limits(
     signal: "Signal", factor: Fraction, offset: Fraction
 ) -> tuple[Fraction, Fraction] | None:
-    """Minimum and maximum of the file as raw values; None where it gives none: [0|0]."""
+    """Return minimum and maximum of the file as raw values.
+
+    None if the file has no limits, which is written as [0|0].
+    """
     if signal.minimum is None or signal.maximum is None or signal.minimum == signal.maximum == 0:
         return None
-    ends = sorted((exact(end) - offset) / factor for end in (signal.minimum, signal.maximum))
-    return ends[0], ends[1]
+    low = (exact(signal.minimum) - offset) / factor
+    high = (exact(signal.maximum) - offset) / factor
+    return min(low, high), max(low, high)

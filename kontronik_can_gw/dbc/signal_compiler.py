@@ -1,4 +1,4 @@
-"""Compiles one signal of a DBC: what its raw values mean, and what fills it."""
+"""Compiles one signal of a DBC: the meaning of its raw values, and its source."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 
 class UnfitSignal(Exception):
-    """Why a signal cannot be sent, as it follows the signal's place in an error."""
+    """The reason why a signal cannot be sent. In an error it follows the signal's name."""
 
 
 @dataclass
 class Compilation:
-    """A DBC and how it is used, and what is found while it is compiled."""
+    """A DBC, its settings, and the results of its compilation."""
 
     database: "Database"
     file: str
@@ -37,14 +37,15 @@ class Compilation:
     problems: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     units: set[str] = field(default_factory=set)
-    """Unit texts of our signals."""
+    """Unit texts of the gateway's signals."""
     send_types: set[str] = field(default_factory=set)
+    """Texts of GenMsgSendType of the gateway's messages."""
     unbound: set[str] = field(default_factory=set)
     """Signals without a source."""
 
 
 class SignalCompiler:
-    """Makes the plans of one signal, one for each page it is on."""
+    """Makes the plans of one signal. A signal has a plan for each of its pages."""
 
     def __init__(self, job: Compilation, copy: Copy, signal: "Signal") -> None:
         self.job = job
@@ -54,15 +55,15 @@ class SignalCompiler:
         self.start = attribute(signal, "GenSigStartValue", job.database)
         self.start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
         self.start_raw = None
-        """Raw bits of the start value; None for one that the signal cannot hold."""
+        """Raw bits of the start value. None if the signal cannot contain it."""
         if isinstance(self.start, (int, float)):
             self.start_raw = raw_values.constant(signal, self.start, Fraction(1), Fraction(0))
 
     def plan(self, page: int | None) -> SignalPlan | None:
-        """The plan on a page; None, with a line in the problems, where the signal cannot be sent."""
+        """Return the plan on a page. None if it cannot be sent, with a line in the problems."""
         try:
             self._check()
-            return self._filled(self._unfilled(page))
+            return self._with_source(self._without_source(page))
         except UnfitSignal as error:
             self.job.problems.append(f"{self._where}: {error}")
             return None
@@ -72,8 +73,10 @@ class SignalCompiler:
         return f"{self.job.file}: {self.copy.message.name}.{self.signal.name}"
 
     def _check(self) -> None:
-        """UnfitSignal for a length or a value table that cannot be sent."""
-        signal, length, entries = self.signal, self.signal.length, self.table.entries
+        """Raise UnfitSignal for a length or a value table that cannot be sent."""
+        signal = self.signal
+        length = signal.length
+        entries = self.table.entries
         if signal.is_float and length not in (32, 64):
             raise UnfitSignal(f"a float of {length} bits cannot be sent; 32 and 64 can.")
         if signal.is_float:
@@ -83,34 +86,44 @@ class SignalCompiler:
                 )
             return
         low, high = raw_range(signal)
-        if wide := [f"{raw} {text!r}" for raw, text in entries.items() if not low <= raw <= high]:
+        outside = [f"{raw} {text!r}" for raw, text in entries.items() if not low <= raw <= high]
+        if outside:
             raise UnfitSignal(
-                f"cannot hold {', '.join(wide)} of its value table; its values are {low} to {high}."
+                f"cannot hold {', '.join(outside)} of its value table; "
+                f"its values are {low} to {high}."
             )
 
     def _scale(self) -> tuple[Fraction, Fraction, tuple[Fraction, Fraction] | None]:
-        """Factor, offset, and limits as raw values. UnfitSignal for numbers that nothing can be computed with."""
+        """Return factor, offset, and limits as raw values.
+
+        Raises UnfitSignal for numbers that are not finite or too large.
+        """
         signal = self.signal
         if signal.scale == 0:
             raise UnfitSignal("has factor 0.")
         try:
-            factor, offset = exact(signal.scale), exact(signal.offset)
+            factor = exact(signal.scale)
+            offset = exact(signal.offset)
             limits = raw_values.limits(signal, factor, offset)
-            for end in (*(raw * factor + offset for raw in raw_range(signal)), *(limits or ())):
-                float(end)
+            for raw in raw_range(signal):
+                float(raw * factor + offset)
+            for limit in limits or ():
+                float(limit)
         except ValueError:
             raise UnfitSignal("has a factor, offset or limit that is no finite number.") from None
         except OverflowError:
             raise UnfitSignal("has a factor, offset or limit that is too large.") from None
         return factor, offset, limits
 
-    def _unfilled(self, page: int | None) -> SignalPlan:
-        """The plan as a constant 0."""
-        signal, table = self.signal, self.table
+    def _without_source(self, page: int | None) -> SignalPlan:
+        """Return the plan of a constant 0."""
+        signal = self.signal
+        table = self.table
         factor, offset, limits = self._scale()
         low, high = raw_range(signal)
         if limits is not None:
-            low, high = max(low, math.ceil(limits[0])), min(high, math.floor(limits[1]))
+            low = max(low, math.ceil(limits[0]))
+            high = min(high, math.floor(limits[1]))
         while high in table.special:
             high -= 1
         while low in table.special:
@@ -136,35 +149,42 @@ class SignalCompiler:
         return self._float(plan, limits) if signal.is_float else plan
 
     def _not_available(self) -> int:
-        """The raw value for "not available": by the value table, else the start value, else an end of the range."""
+        """Return the raw value for "not available".
+
+        It is given by the value table, otherwise by the start value, and otherwise by an end of the
+        range.
+        """
         if self.table.not_available is not None:
             return self.table.not_available
-        # a start value that is a mere default does not mean "not available"; a flag has nothing better
+        # a default start value does not mean "not available", but a flag has no other code
         if self.start_raw is not None and (self.start_is_set or self.signal.length == 1):
             return self.start_raw
         low, high = raw_range(self.signal)
         return low if self.signal.is_signed else high
 
     def _float(self, plan: SignalPlan, limits: tuple[Fraction, Fraction] | None) -> SignalPlan:
-        """The plan with the codes as bits of a float: from the value table, else NaN."""
-        not_available, error = (
-            float_bits(math.nan if raw is None else raw, plan.length) or 0
-            for raw in (self.table.not_available, self.table.error)
+        """Return the plan with the codes of the value table as bits of a float, or NaN."""
+        table = self.table
+        not_available = math.nan if table.not_available is None else table.not_available
+        error = math.nan if table.error is None else table.error
+        plan = replace(
+            plan,
+            not_available=float_bits(not_available, plan.length) or 0,
+            error=float_bits(error, plan.length) or 0,
         )
-        plan = replace(plan, not_available=not_available, error=error)
         if limits is None:
             return plan
         return replace(plan, limits=(float(limits[0]), float(limits[1])))
 
     def _unit(self) -> str:
-        """The unit after ``dbc.units``; empty where none is given."""
+        """Return the unit according to ``dbc.units``. Empty if there is none."""
         text = (self.signal.unit or "").strip()
         self.job.units.add(text)
         text = self.job.settings.units.get(text, text)
         return "" if units.says_nothing(text) else text
 
-    def _filled(self, plan: SignalPlan) -> SignalPlan:
-        """The plan with what fills the signal."""
+    def _with_source(self, plan: SignalPlan) -> SignalPlan:
+        """Return the plan with the source of the signal's value."""
         if self.signal.is_multiplexer:
             return replace(plan, role=Role.MULTIPLEXER)
         bound = self.job.binder.bound(self.copy, self.signal.name)
@@ -174,12 +194,15 @@ class SignalCompiler:
                 raise UnfitSignal(f"the constant {bound} bound to it cannot be sent exactly.")
             return replace(plan, constant=constant)
         name = self.signal.name if bound is None else bound
-        if (found := self.job.binder.by_name(name, self.copy.esc)) is not None:
+        found = self.job.binder.by_name(name, self.copy.esc)
+        if found is not None:
             return self._bound(plan, *found)
-        if (role := names.protection(name)) is not None:
+        role = names.protection(name)
+        if role is not None:
             if role is Role.ALIVE and (plan.is_float or plan.low > 0 or plan.high < 2):
                 raise UnfitSignal(
-                    "an alive counter needs a whole number of 2 bits or more that begins at 0. Or bind it to a constant."
+                    "an alive counter needs a whole number of 2 bits or more that begins at 0. "
+                    "Or bind it to a constant."
                 )
             return replace(plan, role=role)
         if bound is None and self.job.settings.unbound == "start_value":
@@ -201,38 +224,49 @@ class SignalCompiler:
         return replace(plan, esc=esc)
 
     def _start_value(self, plan: SignalPlan) -> int:
-        """The raw bits of an unbound signal: its own start value, else NotAvailable, else the default or 0."""
+        """Return the raw bits of an unbound signal.
+
+        They are its own start value, otherwise NotAvailable, and otherwise the default or 0.
+        """
         if not self.start_is_set and self.table.not_available is not None:
             return plan.not_available
         if not self.start:
             return 0
         if self.start_raw is None:
             raise UnfitSignal(
-                f"its GenSigStartValue {self.start} is none of its raw values. Bind it to a constant."
+                f"its GenSigStartValue {self.start} is none of its raw values. "
+                "Bind it to a constant."
             )
         return self.start_raw
 
     def _flag_on_loss(self) -> int | None:
-        """Value without telemetry, 0 or 1, of a flag that has no code for it; None: its own code or start value."""
+        """Return the value without telemetry, 0 or 1, of a flag that has no code for it.
+
+        None: its own code or start value is used.
+        """
         if self.table.not_available is not None:
             return None
         chosen = self.job.settings.flags_on_loss
-        own = self.start_is_set and self.start_raw is not None
-        return None if chosen is None and own else chosen or 0
+        if chosen is not None:
+            return chosen
+        has_start_value = self.start_is_set and self.start_raw is not None
+        return None if has_start_value else 0
 
 
 def _bound_plan(
     plan: SignalPlan, table: ValueTable, value: Value, on_loss: int | None
 ) -> SignalPlan:
-    """The plan of a signal with the value as its source. UnfitSignal where it cannot show the value.
+    """Return the plan of a signal with ``value`` as its source.
 
-    ``on_loss``: what a flag holds without telemetry, 0 or 1; None: its code.
+    ``on_loss`` is the value of a flag without telemetry, 0 or 1, or None for its code. Raises
+    UnfitSignal if the signal cannot show the value.
     """
     slope, intercept = _scale(plan, value)
     plan = replace(plan, role=Role.SOURCE, source=value, slope=slope, intercept=intercept)
     numbers = table.numbers(value)
     notes = [*_notes_on_names(value, numbers)]
-    low, high = plan.low, plan.high
+    low = plan.low
+    high = plan.high
     if value.bit is not None and plan.length == 1:
         plan = _flag(plan, on_loss)
     if value.rolls:
@@ -250,7 +284,7 @@ def _bound_plan(
 
 
 def _scale(plan: SignalPlan, value: Value) -> tuple[Fraction, Fraction]:
-    """Slope and intercept, from the value's steps to raw values."""
+    """Return slope and intercept of the conversion from the value's steps to raw values."""
     converted = units.conversion(value.unit, plan.unit)
     if converted is None:
         can = ", ".join(units.texts_like(value.unit))
@@ -259,7 +293,9 @@ def _scale(plan: SignalPlan, value: Value) -> tuple[Fraction, Fraction]:
             f"{plan.unit!r}. Possible: {can}; dbc.units says what other texts mean."
         )
     scale, shift = converted
-    return scale / value.per_unit / plan.factor, (shift - plan.offset) / plan.factor
+    slope = scale / value.per_unit / plan.factor
+    intercept = (shift - plan.offset) / plan.factor
+    return slope, intercept
 
 
 def _notes_on_names(value: Value, numbers: Mapping[int, int]) -> Iterator[str]:
@@ -271,8 +307,9 @@ def _notes_on_names(value: Value, numbers: Mapping[int, int]) -> Iterator[str]:
 
 
 def _flag(plan: SignalPlan, on_loss: int | None) -> SignalPlan:
-    """The plan of a flag in one bit: both its raw values are values."""
-    raws = [math.floor(value * plan.slope + plan.intercept + Fraction(1, 2)) for value in (0, 1)]
+    """Return the plan of a flag in one bit. Both raw values of the bit are values."""
+    half = Fraction(1, 2)
+    raws = [math.floor(value * plan.slope + plan.intercept + half) for value in (0, 1)]
     if any(not plan.low <= raw <= plan.high and raw != plan.error for raw in raws):
         sign = " Make it unsigned." if plan.signed else ""
         raise UnfitSignal(f"cannot hold both values of a flag, 0 and 1.{sign}")

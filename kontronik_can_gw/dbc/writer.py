@@ -1,7 +1,8 @@
-"""Writes DBC text that every tool reads, without loss: cantools reads back the same database. Messages are written as sent.
+"""Writes a DBC without loss, as text that every tool reads. Messages are written as sent.
 
-cantools' own writer leaves out attributes that equal their default, rewrites start values as floats, and does not escape the quotes
-of database comments and text attributes.
+cantools reads back the same database. Its own writer is not used, because it leaves out attributes
+that equal their default, writes start values as floats, and does not escape the quotes in database
+comments and text attributes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,17 +16,23 @@ if TYPE_CHECKING:
     from cantools.database.can import Database, Signal
 
 _LONG_NAMES = frozenset(
-    {f"System{kind}LongSymbol" for kind in ("Node", "Message", "Signal", "EnvVar")}
+    {
+        "SystemNodeLongSymbol",
+        "SystemMessageLongSymbol",
+        "SystemSignalLongSymbol",
+        "SystemEnvVarLongSymbol",
+    }
 )
-"""Attributes not written: cantools has already replaced the short names by these long ones."""
+"""Attributes that are not written, because cantools has used them to replace the short names."""
 
 
 @dataclass
 class SignalRow:
-    """A signal as the file has it: numbers in the units of the file, ``start`` as DBC counts bits, attributes by name."""
+    """A signal in the terms of a DBC. Numbers are in the units of the file."""
 
     name: str
     start: int
+    """The start bit as a DBC counts bits."""
     length: int
     comment: str | None = None
     is_little_endian: bool = True
@@ -39,16 +46,20 @@ class SignalRow:
     multiplexing: str = ""
     """``M`` for a multiplexer, ``m1`` for a signal of page 1, ``m1M`` for both."""
     pages: str = ""
-    """Its line of SG_MUL_VAL_ from the multiplexer's name on; empty where ``multiplexing`` says all."""
+    """Its line of SG_MUL_VAL_, beginning with the multiplexer's name.
+
+    Empty if ``multiplexing`` is sufficient.
+    """
     texts: Mapping[int, object] = field(default_factory=dict)
     attributes: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass
 class MessageRow:
-    """A message as the file has it; ``key``: its id, with EXTENDED for 29 bits. ``groups``: lines of SIG_GROUP_ from the name on."""
+    """A message in the terms of a DBC."""
 
     key: int
+    """The id, with EXTENDED for 29 bits."""
     name: str
     length: int
     senders: Sequence[str]
@@ -56,15 +67,21 @@ class MessageRow:
     attributes: Mapping[str, object]
     signals: Sequence[SignalRow]
     groups: Sequence[str] = ()
+    """Lines of SIG_GROUP_, beginning with the group's name."""
 
 
 def copies_text(
     database: "Database", copies: Sequence[Copy] | None = None, version: str | None = None
 ) -> str:
-    """A database as text. ``copies``: its messages as they are sent; None: as they stand."""
-    sent = [Copy(message) for message in database.messages] if copies is None else copies
-    relations = [*_relations(database, sent)]
-    return dbc_text(database, [_message(each) for each in sent], version, relations)
+    """Return a database as text.
+
+    ``copies``: its messages as they are sent. None: the messages of the database unchanged.
+    """
+    if copies is None:
+        copies = [Copy(message) for message in database.messages]
+    relations = [*_relations(database, copies)]
+    messages = [_message(copy) for copy in copies]
+    return dbc_text(database, messages, version, relations)
 
 
 def dbc_text(
@@ -73,41 +90,77 @@ def dbc_text(
     version: str | None = None,
     relations: Sequence[str] = (),
 ) -> str:
-    """The DBC text: sections in the usual order, signals in bit order, one line for each entry, LF line ends.
+    """Return the text of a DBC with ``messages`` and the lines BA_REL_ of ``relations``.
 
-    All but the messages is taken from ``database``, and the lines BA_REL_ are those of ``relations``.
+    All other parts are taken from ``database``. Sections have the usual order, signals the order of
+    their bits, each entry is a line, and lines end with LF.
     """
     dbc: Any = database.dbc
-    signals = [(m.key, s) for m in messages for s in _sorted(m)]
-    definitions = [("", d) for d in dbc.attribute_definitions.values()]
-    definitions += [("REL_", d) for d in dbc.relation_attribute_definitions.values()]
-    sections = (
-        [f'VERSION "{_escaped((version or database.version) or "")}"'],
+    nodes = [node.name for node in database.nodes]
+    version = (version or database.version) or ""
+    sections = [
+        [f'VERSION "{_escaped(version)}"'],
         ["NS_ :"],
         ["BS_:"],
-        [" ".join(["BU_:", *(node.name for node in database.nodes)])],
+        [" ".join(["BU_:", *nodes])],
         [f"VAL_TABLE_ {name} {_texts(table)} ;" for name, table in dbc.value_tables.items()],
-        *([_head(m), *map(_line, _sorted(m))] for m in messages),
-        [f"BO_TX_BU_ {m.key} : {','.join(m.senders)};" for m in messages if len(m.senders) > 1],
-        [*_environment(dbc.environment_variables.values())],
-        [*_comments(database, messages)],
-        [f"BA_DEF_{rel} {_definition(d)};" for rel, d in definitions],
-        [
-            f'BA_DEF_DEF_{rel} "{d.name}" {_default(d)};'
-            for rel, d in definitions
-            if d.default_value is not None
-        ],
+    ]
+    for message in messages:
+        lines = [_line(signal) for signal in _sorted(message)]
+        sections.append([_head(message), *lines])
+    sections += [
+        _further_senders(messages),
+        list(_environment(dbc.environment_variables.values())),
+        list(_comments(database, messages)),
+        *_definitions(dbc),
         [*_attributes(database, messages), *relations],
-        [f"VAL_ {key} {s.name} {_texts(s.texts)} ;" for key, s in signals if s.texts],
-        [f"SIG_GROUP_ {m.key} {group};" for m in messages for group in m.groups],
-        [
-            f"SIG_VALTYPE_ {key} {s.name} : {1 if s.length == 32 else 2};"
-            for key, s in signals
-            if s.is_float
-        ],
-        [f"SG_MUL_VAL_ {key} {s.name} {s.pages};" for key, s in signals if s.pages],
-    )
-    return "\n\n".join("\n".join(section) for section in sections if section) + "\n"
+        *_details(messages),
+    ]
+    texts = ["\n".join(section) for section in sections if section]
+    return "\n\n".join(texts) + "\n"
+
+
+def _further_senders(messages: Sequence[MessageRow]) -> list[str]:
+    """Return the lines of messages with several senders."""
+    lines = []
+    for message in messages:
+        if len(message.senders) > 1:
+            lines.append(f"BO_TX_BU_ {message.key} : {','.join(message.senders)};")
+    return lines
+
+
+def _definitions(dbc: Any) -> tuple[list[str], list[str]]:
+    """Return the sections with the definitions and the defaults of attributes."""
+    definitions: list[str] = []
+    defaults: list[str] = []
+    kinds = (("", dbc.attribute_definitions), ("REL_", dbc.relation_attribute_definitions))
+    for suffix, table in kinds:
+        for definition in table.values():
+            definitions.append(f"BA_DEF_{suffix} {_definition(definition)};")
+            if definition.default_value is not None:
+                default = _default(definition)
+                defaults.append(f'BA_DEF_DEF_{suffix} "{definition.name}" {default};')
+    return definitions, defaults
+
+
+def _details(messages: Sequence[MessageRow]) -> tuple[list[str], ...]:
+    """Return the sections with value tables, signal groups, float types and multiplexing."""
+    tables: list[str] = []
+    groups: list[str] = []
+    types: list[str] = []
+    pages: list[str] = []
+    for message in messages:
+        groups += [f"SIG_GROUP_ {message.key} {group};" for group in message.groups]
+        for signal in _sorted(message):
+            place = f"{message.key} {signal.name}"
+            if signal.texts:
+                tables.append(f"VAL_ {place} {_texts(signal.texts)} ;")
+            if signal.is_float:
+                number = 1 if signal.length == 32 else 2
+                types.append(f"SIG_VALTYPE_ {place} : {number};")
+            if signal.pages:
+                pages.append(f"SG_MUL_VAL_ {place} {signal.pages};")
+    return tables, groups, types, pages
 
 
 # --- rows of a database
@@ -115,45 +168,56 @@ def dbc_text(
 
 def _message(sent: Copy) -> MessageRow:
     message = sent.message
-    several = sum(signal.is_multiplexer for signal in message.signals) > 1
-    in_pages = several or any(len(s.multiplexer_ids or ()) > 1 for s in message.signals)
+    multiplexers = sum(signal.is_multiplexer for signal in message.signals)
+    most_pages = max((len(signal.multiplexer_ids or ()) for signal in message.signals), default=0)
+    in_pages = multiplexers > 1 or most_pages > 1
+    groups = []
+    for group in message.signal_groups or ():
+        names = " ".join(sent.prefix + name for name in group.signal_names)
+        groups.append(f"{group.name} {group.repetitions} : {names}")
     return MessageRow(
-        sent.key,
-        sent.name,
-        message.length,
-        message.senders,
-        message.comment,
-        _own_attributes(message),
-        [_signal(signal, name, sent.prefix, in_pages) for signal, name in sent.signals()],
-        [
-            f"{g.name} {g.repetitions} : {' '.join(sent.prefix + name for name in g.signal_names)}"
-            for g in message.signal_groups or ()
-        ],
+        key=sent.key,
+        name=sent.name,
+        length=message.length,
+        senders=message.senders,
+        comment=message.comment,
+        attributes=_own_attributes(message),
+        signals=[_signal(signal, name, sent.prefix, in_pages) for signal, name in sent.signals()],
+        groups=groups,
     )
 
 
 def _signal(signal: "Signal", name: str, prefix: str, in_pages: bool) -> SignalRow:
-    """``in_pages``: several multiplexers, or several values for a signal: its message needs SG_MUL_VAL_."""
+    """Return the row of a signal.
+
+    ``in_pages``: its message has several multiplexers, or several pages for a signal, and therefore
+    needs SG_MUL_VAL_.
+    """
     pages = signal.multiplexer_ids or ()
     multiplexing = f"m{pages[0]}" if pages else ""
-    ranges = ", ".join(f"{n}-{n}" for n in pages)
+    if signal.is_multiplexer:
+        multiplexing += "M"
+    page_ranges = ""
+    if in_pages and pages:
+        ranges = ", ".join(f"{page}-{page}" for page in pages)
+        page_ranges = f"{prefix}{signal.multiplexer_signal} {ranges}"
     return SignalRow(
-        name,
-        signal.start,
-        signal.length,
-        signal.comment,
-        signal.byte_order == "little_endian",
-        signal.is_signed,
-        signal.is_float,
-        signal.scale,
-        signal.offset,
-        (signal.minimum or 0, signal.maximum or 0),
-        signal.unit or "",
-        signal.receivers,
-        multiplexing + ("M" if signal.is_multiplexer else ""),
-        f"{prefix}{signal.multiplexer_signal} {ranges}" if in_pages and pages else "",
-        signal.choices or {},
-        _own_attributes(signal),
+        name=name,
+        start=signal.start,
+        length=signal.length,
+        comment=signal.comment,
+        is_little_endian=signal.byte_order == "little_endian",
+        is_signed=signal.is_signed,
+        is_float=signal.is_float,
+        factor=signal.scale,
+        offset=signal.offset,
+        limits=(signal.minimum or 0, signal.maximum or 0),
+        unit=signal.unit or "",
+        receivers=signal.receivers,
+        multiplexing=multiplexing,
+        pages=page_ranges,
+        texts=signal.choices or {},
+        attributes=_own_attributes(signal),
     )
 
 
@@ -174,7 +238,7 @@ def _escaped(text: str) -> str:
 
 
 def _number(value: Any) -> str:
-    """A fraction that is not whole: the nearest float."""
+    """Return a number as text. A fraction that is not whole becomes the nearest float."""
     if isinstance(value, Fraction):
         value = value.numerator if value.denominator == 1 else float(value)
     if isinstance(value, float) and value.is_integer() and abs(value) < 1 << 63:
@@ -191,52 +255,67 @@ def _head(message: MessageRow) -> str:
     return f"BO_ {message.key} {message.name}: {message.length} {sender}"
 
 
-def _line(s: SignalRow) -> str:
-    multiplexing = f" {s.multiplexing}" if s.multiplexing else ""
-    place = f"{s.start}|{s.length}@{int(s.is_little_endian)}{'-' if s.is_signed else '+'}"
-    limits = "|".join(map(_number, s.limits))
-    return (
-        f" SG_ {s.name}{multiplexing} : {place} ({_number(s.factor)},{_number(s.offset)}) "
-        f'[{limits}] "{_escaped(s.unit)}" {",".join(s.receivers) or "Vector__XXX"}'
-    )
+def _line(signal: SignalRow) -> str:
+    name = signal.name
+    if signal.multiplexing:
+        name += f" {signal.multiplexing}"
+    byte_order = "1" if signal.is_little_endian else "0"
+    sign = "-" if signal.is_signed else "+"
+    place = f"{signal.start}|{signal.length}@{byte_order}{sign}"
+    scale = f"({_number(signal.factor)},{_number(signal.offset)})"
+    limits = "|".join(map(_number, signal.limits))
+    receivers = ",".join(signal.receivers) or "Vector__XXX"
+    unit = _escaped(signal.unit)
+    return f' SG_ {name} : {place} {scale} [{limits}] "{unit}" {receivers}'
 
 
 def _environment(variables: Any) -> Iterator[str]:
-    for v in variables:
+    for variable in variables:
+        limits = f"[{_number(variable.minimum)}|{_number(variable.maximum)}]"
+        unit = _escaped(variable.unit)
+        initial = _number(variable.initial_value)
+        nodes = ",".join(variable.access_nodes)
         yield (
-            f'EV_ {v.name}: {v.env_type} [{_number(v.minimum)}|{_number(v.maximum)}] "{_escaped(v.unit)}" '
-            f"{_number(v.initial_value)} {v.env_id} {v.access_type} {','.join(v.access_nodes)};"
+            f'EV_ {variable.name}: {variable.env_type} {limits} "{unit}" '
+            f"{initial} {variable.env_id} {variable.access_type} {nodes};"
         )
-    for v in variables:
-        if v.data_size is not None:
-            yield f"ENVVAR_DATA_ {v.name}: {v.data_size};"
+    for variable in variables:
+        if variable.data_size is not None:
+            yield f"ENVVAR_DATA_ {variable.name}: {variable.data_size};"
 
 
 def _comments(database: "Database", messages: Sequence[MessageRow]) -> Iterator[str]:
     dbc: Any = database.dbc
     found = [("", bus.comment) for bus in database.buses]
     found += [(f"BU_ {node.name} ", node.comment) for node in database.nodes]
-    for m in messages:
-        found.append((f"BO_ {m.key} ", m.comment))
-        found += [(f"SG_ {m.key} {s.name} ", s.comment) for s in _sorted(m)]
-    found += [(f"EV_ {v.name} ", v.comment) for v in dbc.environment_variables.values()]
-    return (f'CM_ {owner}"{_escaped(text)}";' for owner, text in found if text is not None)
+    for message in messages:
+        found.append((f"BO_ {message.key} ", message.comment))
+        for signal in _sorted(message):
+            found.append((f"SG_ {message.key} {signal.name} ", signal.comment))
+    for variable in dbc.environment_variables.values():
+        found.append((f"EV_ {variable.name} ", variable.comment))
+    for owner, text in found:
+        if text is not None:
+            yield f'CM_ {owner}"{_escaped(text)}";'
 
 
 def _definition(definition: Any) -> str:
-    kind, name = definition.kind or "", definition.type_name
-    values, ends = "", (definition.minimum, definition.maximum)
+    kind = definition.kind or ""
+    name = definition.type_name
+    limits = (definition.minimum, definition.maximum)
+    values = ""
     if name == "ENUM":
         values = ",".join(f'"{_escaped(choice)}"' for choice in definition.choices)
-    elif name != "STRING" and None not in ends:
-        values = " ".join(map(_number, ends))
+    elif name != "STRING" and None not in limits:
+        values = " ".join(map(_number, limits))
     return f'{kind} "{definition.name}" {name} {values}'.lstrip()
 
 
 def _default(definition: Any) -> str:
     value = definition.default_value
-    is_text = definition.type_name in ("STRING", "ENUM")
-    return f'"{_escaped(str(value))}"' if is_text else _number(value)
+    if definition.type_name in ("STRING", "ENUM"):
+        return f'"{_escaped(str(value))}"'
+    return _number(value)
 
 
 def _value(value: Any, definition: Any) -> str:
@@ -251,10 +330,12 @@ def _attributes(database: "Database", messages: Sequence[MessageRow]) -> Iterato
     dbc: Any = database.dbc
     owners = [("", _own_attributes(database))]
     owners += [(f"BU_ {node.name} ", _own_attributes(node)) for node in database.nodes]
-    owners += [(f"BO_ {m.key} ", m.attributes) for m in messages]
-    owners += [(f"SG_ {m.key} {s.name} ", s.attributes) for m in messages for s in _sorted(m)]
-    variables = dbc.environment_variables.values()
-    owners += [(f"EV_ {variable.name} ", _own_attributes(variable)) for variable in variables]
+    owners += [(f"BO_ {message.key} ", message.attributes) for message in messages]
+    for message in messages:
+        for signal in _sorted(message):
+            owners.append((f"SG_ {message.key} {signal.name} ", signal.attributes))
+    for variable in dbc.environment_variables.values():
+        owners.append((f"EV_ {variable.name} ", _own_attributes(variable)))
     for owner, attributes in owners:
         for name, value in attributes.items():
             text = _value(value, dbc.attribute_definitions[name])
@@ -271,18 +352,16 @@ def _relations(database: "Database", sent: Sequence[Copy]) -> Iterator[str]:
     for each in sent:
         copies.setdefault(Copy(each.message).key, []).append(each)
     for number, by_signal in relations.node_signal_relations.items():
-        found += [
-            (f"BU_SG_REL_ {node} SG_ {each.key} {each.prefix + signal}", attributes)
-            for each in copies.get(number, ())
-            for signal, by_node in by_signal.items()
-            for node, attributes in by_node.items()
-        ]
+        for each in copies.get(number, ()):
+            for signal, by_node in by_signal.items():
+                target = f"SG_ {each.key} {each.prefix + signal}"
+                for node, attributes in by_node.items():
+                    found.append((f"BU_SG_REL_ {node} {target}", attributes))
     for number, by_node in relations.node_message_relations.items():
-        found += [
-            (f"BU_BO_REL_ {node} {each.key}", attributes)
-            for each in copies.get(number, ())
-            for node, attributes in by_node.items()
-        ]
+        for each in copies.get(number, ()):
+            for node, attributes in by_node.items():
+                found.append((f"BU_BO_REL_ {node} {each.key}", attributes))
     for owner, attributes in found:
-        for a in attributes.values():
-            yield f'BA_REL_ "{a.name}" {owner} {_value(a.value, a.definition)};'
+        for attribute in attributes.values():
+            value = _value(attribute.value, attribute.definition)
+            yield f'BA_REL_ "{attribute.name}" {owner} {value};'

@@ -1,1 +1,4 @@
-"""Work beside the live gateway: decoding recordings, simulated ESCs on pseudo terminals. Does I/O and may read the clock."""
+"""Tools for a user's desk: recordings, reports, the monitor, MQTT, metrics and diagnosis.
+
+They do I/O and may read the clock.
+"""

@@ -60,18 +60,19 @@ class Member:
         for at, column in enumerate(view.reader.columns):
             if column.esc == index:
                 self.columns.setdefault(column.source, at)
-        self.no_flags = {n: at for n, at in self.columns.items() if n not in self.protocol.bits}
+        self.no_flags: dict[str, int] = {}
         """The columns of the values that are not flags."""
-        self.of_group = {
-            group: [at for name, at in self.no_flags.items() if VALUES[name].group is group]
-            for group in Group
-        }
+        self.of_group: dict[Group, list[int]] = {group: [] for group in Group}
         """The columns in ``no_flags`` of each group."""
-        self._bits = {
-            word: {bit: self.columns.get(bit.text) for bit in self.protocol.errors.get(word, ())}
-            for word in _WORDS
-        }
+        for name, at in self.columns.items():
+            if name not in self.protocol.bits:
+                self.no_flags[name] = at
+                self.of_group[VALUES[name].group].append(at)
+        self._bits: dict[str, dict[ErrorBit, int | None]] = {}
         """Bits of each error word, with the column of a bit that has a signal, or None."""
+        for word in _WORDS:
+            bits = self.protocol.errors.get(word, ())
+            self._bits[word] = {bit: self.columns.get(bit.text) for bit in bits}
         self.factors: dict[str, tuple[float, float]] = {}
         """Factor and offset of values whose signal has another unit than their source."""
         for name, at in self.columns.items():
@@ -127,7 +128,7 @@ class Member:
         """The link state's name. None if it is not available.
 
         The link state has its own message. After a gap that message is up to a cycle later than
-        live values, so the link counts as good while live values are available.
+        live values, so the link is reported as good while live values are available.
         """
         link = self.text("link_state")
         is_bad = link is not None and normalize(link) not in ("ok", "degraded")
@@ -185,7 +186,10 @@ class Member:
         if has_other_values and not self.is_known(group):
             return None
         number = int(whole or 0)
-        found: list[Alarm] = [bit for bit in bits if number >> bit & 1 or flags.get(bit) == 1]
+        found: list[Alarm] = []
+        for bit in bits:
+            if number >> bit & 1 or flags.get(bit) == 1:
+                found.append(bit)
         for position in range(32):
             if number >> position & 1 and position not in bits:
                 meaning = f"bit {position} of {word}, which has no name"

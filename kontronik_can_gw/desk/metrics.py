@@ -99,8 +99,10 @@ def families(document: Document, age_s: float) -> list[Metric]:
             kind = "counter" if name.endswith("_total") else "gauge"
             text = name.replace("_", " ")
             found[full_name] = Metric(full_name.removesuffix("_total"), text, kind)
-        # A file's name is not always valid UTF-8.
-        texts = {k: str(v).encode("utf-8", "replace").decode() for k, v in labels.items()}
+        texts = {}
+        for label, content in labels.items():
+            # the name of a file is not always valid UTF-8
+            texts[label] = str(content).encode("utf-8", "replace").decode()
         found[full_name].add_sample(full_name, texts, float(value))
     return list(found.values())
 
@@ -162,9 +164,12 @@ def _error_bits(esc: Document, labels: dict[str, object]) -> Iterator[Sample]:
         lists = [esc[key] for key in keys]
         if None in lists:  # the word is not available
             continue
-        set_names = {name for names in lists for name in names}
+        set_names: set[str] = set()
+        for names in lists:
+            set_names.update(names)
         severities = dict.fromkeys(sorted(set_names), "error")
-        severities |= {bit.text: bit.severity.value for bit in bits.get(f"{word}s", ())}
+        for bit in bits.get(f"{word}s", ()):
+            severities[bit.text] = bit.severity.value
         for error, severity in severities.items():
             yield word, error in set_names, labels | {"error": error, "severity": severity}
 

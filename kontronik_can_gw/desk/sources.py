@@ -1,4 +1,7 @@
-"""Where the frames of monitor and MQTT come from: the CAN bus, to which nothing is sent, a recording in real time, or a simulation."""
+"""Sources of CAN frames for the monitor and MQTT.
+
+They are the CAN bus, to which nothing is sent, a recording in real time, and a simulation.
+"""
 
 import queue
 import time
@@ -31,51 +34,56 @@ from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND
 
 _MAX_LAG_S = 0.5
+"""Longest delay after which a recording is played faster to make up for it."""
 _LONGEST_SLEEP_S = 0.05
 
 Take = Callable[[CanFrame, int], None]
 
 
 class Source:
-    """Frames with their time."""
+    """A source of frames with their times."""
 
     is_file = False
     ended = False
     paused = False
     problem = ""
-    """One line while no frames can come."""
+    """The reason why frames cannot be received, in one line. Empty while they can be received."""
     hints: tuple[str, ...] = ()
-    """Possible causes where no frame comes."""
+    """Possible causes if no frame is received."""
     progress = ""
     simulation = ""
-    """What is simulated, if the frames are not those of a real bus."""
+    """Description of the simulation. Empty for a real bus and a recording."""
 
     def __init__(self, name: str, bus: BusLayout) -> None:
         self.name = name
         self.bus = bus
 
     def pump(self, take: Take, until_s: float) -> None:
-        """Pass on the frames that come until this time of ``time.monotonic``; may return sooner."""
+        """Pass frames to ``take`` until this time of ``time.monotonic``. May return earlier."""
         raise NotImplementedError
 
     def now(self) -> int:
-        """The present time on the clock of the frames, in ns."""
+        """Return the present time on the clock of the frames, in ns."""
         return time.monotonic_ns()
 
     def wall_ns(self) -> int | None:
-        """Unix time of ``now``; None where not known."""
+        """Return the Unix time of ``now``. None if it is unknown."""
         return time.time_ns()
 
 
 def can_config(bus: BusLayout, interface: str | None, channel: str | None) -> CanConfig:
-    """The interface to listen on. UserError for one that python-can does not know, and for an ESC's port, to which nothing may be sent."""
+    """Return the settings of the interface to listen on.
+
+    Raises UserError if python-can does not have the interface. Also raises it if the channel is the
+    port of an ESC, because nothing may be sent to an ESC.
+    """
     if bus.config is None:
         is_fd = any(message.fd for message in bus.layout.messages)
         can = CanConfig(interface=interface or "socketcan", channel=channel or "can0", fd=is_fd)
     else:
         can = bus.config.can
         if interface not in (None, can.interface):
-            # options and channel belong to another kind of interface
+            # the configured options and channel are for another kind of interface
             can = replace(can, interface=interface, options={})
         can = replace(can, channel=channel or can.channel)
         check_devices(replace(bus.config, can=can))
@@ -84,7 +92,10 @@ def can_config(bus: BusLayout, interface: str | None, channel: str | None) -> Ca
 
 
 class Bus(Source):
-    """Frames from the CAN bus, as context manager. RunError where it cannot be opened, unless ``patient``: then it is tried again."""
+    """The CAN bus as a context manager.
+
+    Raises RunError if the bus cannot be opened. If ``patient``, opening is tried again instead.
+    """
 
     def __init__(self, bus: BusLayout, config: CanConfig, patient: bool = False) -> None:
         super().__init__(config.channel, bus)
@@ -114,7 +125,7 @@ class Bus(Source):
 
 
 class _FramesAhead:
-    """Frames of a stream, read by a thread so that nobody has to wait for the next one."""
+    """Reads the frames of a stream in a thread, so that no caller waits for the next frame."""
 
     def __init__(self, frames: Iterator[TimedFrame]) -> None:
         self._frames = frames
@@ -124,7 +135,10 @@ class _FramesAhead:
         Thread(target=self._read_all, daemon=True).start()
 
     def take(self) -> TimedFrame | None:
-        """The next frame; None if it has not arrived yet, or after the last one. Raises the reader's exception at its place."""
+        """Return the next frame. None if it has not arrived yet, and after the last frame.
+
+        An exception of the reader is raised after the frames that were read before it.
+        """
         try:
             found = self._read.get_nowait()
         except queue.Empty:
@@ -136,7 +150,7 @@ class _FramesAhead:
         return found
 
     def close(self) -> None:
-        """Wait for the thread; the stream must have been ended."""
+        """Wait for the thread. The stream must have been ended."""
         while not self.have_ended:
             self.have_ended = self._read.get() is None
 
@@ -150,26 +164,32 @@ class _FramesAhead:
 
 
 class Recording(Source):
-    """Frames from a recording, played in real time times ``speed``; ``at_once``: as fast as it can be read.
+    """A recording that is played at ``speed`` times real time.
 
-    A stream is played as its frames arrive, and waits for nothing. While none arrive its clock goes on, so that values expire.
+    With ``at_once`` it is played as fast as it can be read. A stream is played as its frames
+    arrive. While no frames arrive its clock continues, so that values expire.
     """
 
     is_file = True
 
     def __init__(self, opened: Input, speed: float, at_once: bool = False) -> None:
         super().__init__(Path(opened.name).name, opened.bus)
-        self._input, self._speed, self._at_once = opened, speed, at_once
+        self._input = opened
+        self._speed = speed
+        self._at_once = at_once
         self._frames = opened.frames()
         self._ahead = None if opened.stream is None else _FramesAhead(self._frames)
         self._next: TimedFrame | None = None
         self._has_begun = False
-        self._clock = self._first_ns = 0
+        self._first_ns = 0
+        """Time of the first frame."""
+        self._clock = 0
+        """The present time on the recording's clock."""
         self._last_pump = time.monotonic()
         self._advance()
 
     def _advance(self) -> None:
-        """Fetch the next frame, if there is one yet."""
+        """Fetch the next frame, if it has arrived."""
         if self._ahead is None:
             self._next = next(self._frames, None)
             self.ended = self._next is None
@@ -178,7 +198,8 @@ class Recording(Source):
             self.ended = self._ahead.have_ended
         if not self._has_begun and self._next is not None:
             self._has_begun = True
-            self._clock = self._first_ns = self._next.time_ns
+            self._first_ns = self._next.time_ns
+            self._clock = self._first_ns
             self._input.begin_ns = self._first_ns
 
     def close(self) -> None:
@@ -189,13 +210,16 @@ class Recording(Source):
 
     def pump(self, take: Take, until_s: float) -> None:
         begin = time.monotonic()
-        # a delay is not made up for: a slow reader plays slower than asked for
-        passed, self._last_pump = min(begin - self._last_pump, _MAX_LAG_S), begin
+        # a longer delay is not made up for, so a slow reader plays slower than requested
+        passed_s = min(begin - self._last_pump, _MAX_LAG_S)
+        self._last_pump = begin
         pause = _LONGEST_SLEEP_S
         if not self.paused and not self.ended:
             if self._next is None:
                 self._advance()
-            clock = self._clock + round(passed * self._speed * SECOND) * self._has_begun
+            clock = self._clock
+            if self._has_begun:
+                clock += round(passed_s * self._speed * SECOND)
             while self._next is not None and (self._at_once or self._next.time_ns <= clock):
                 self._clock = max(self._clock, self._next.time_ns)
                 take(self._next.frame, self._clock)
@@ -203,10 +227,11 @@ class Recording(Source):
                 if time.monotonic() >= until_s:
                     break
             else:
-                if not self.ended and not self._at_once:  # at the end the clock stays
+                if not self.ended and not self._at_once:  # the clock stops at the end
                     self._clock = clock
                 if self._next is not None:
-                    pause = min(pause, (self._next.time_ns - clock) / SECOND / self._speed)
+                    wait_s = (self._next.time_ns - clock) / SECOND / self._speed
+                    pause = min(pause, wait_s)
         pause = min(pause, until_s - time.monotonic())
         if pause > 0 and (not self._at_once or self._next is None):
             time.sleep(pause)
@@ -237,10 +262,11 @@ _ERRORS = (
     OperatingError.LIMIT_DISCHARGED_CAPACITY,
 )
 _DEMO_STEP_S = 0.005
+"""Time between two steps of the simulated gateway."""
 
 
 class DemoBus(Source):
-    """A bus on which a gateway sends the telemetry of one flight, again and again."""
+    """A simulated bus on which a gateway repeatedly sends the telemetry of one flight."""
 
     simulation = "simulated ESC and faults"
 
@@ -256,7 +282,7 @@ class DemoBus(Source):
         self._gateway.start(now)
 
     def pump(self, take: Take, until_s: float) -> None:
-        """Let the gateway work until this time."""
+        """Run the gateway until this time."""
         gateway = self._gateway
         while True:
             now = time.monotonic_ns()
@@ -271,11 +297,17 @@ class DemoBus(Source):
 
 
 def _flight(seed: int, start_ns: int) -> SimulatedEsc:
-    """A short flight, again and again, with damaged frames, silences and errors."""
-    errors = tuple(
-        ErrorWindow(_ERRORS[n % len(_ERRORS)], (6 + 13 * n) * SECOND, 3 * SECOND)
-        for n in range(1000)
-    )
-    faults = Faults(flipped_bits=1e-5, dropout=Dropout(SECOND, 17 * SECOND), errors=errors)
-    profile = tuple(phase._replace(duration_s=max(1.5, phase.duration_s * 0.4)) for phase in FLIGHT)
-    return SimulatedEsc(EscOptions(profile=profile, faults=faults), seed=seed, start_ns=start_ns)
+    """Return an ESC in a short flight that is repeated, with damaged frames, gaps and errors."""
+    errors = []
+    for number in range(1000):
+        error = _ERRORS[number % len(_ERRORS)]
+        begin_s = 6 + 13 * number
+        errors.append(ErrorWindow(error, begin_s * SECOND, 3 * SECOND))
+    dropout = Dropout(SECOND, 17 * SECOND)
+    faults = Faults(flipped_bits=1e-5, dropout=dropout, errors=tuple(errors))
+    profile = []
+    for phase in FLIGHT:
+        duration_s = max(1.5, phase.duration_s * 0.4)
+        profile.append(phase._replace(duration_s=duration_s))
+    options = EscOptions(profile=tuple(profile), faults=faults)
+    return SimulatedEsc(options, seed=seed, start_ns=start_ns)

@@ -1,4 +1,4 @@
-"""Times, lengths and numbers as people read them."""
+"""Formats times, durations and numbers for people."""
 
 from datetime import UTC, datetime
 
@@ -6,17 +6,18 @@ from kontronik_can_gw.times import SECOND
 
 
 def clock(time_ns: int) -> str:
-    """A time of the recording as 1:02.5 or 1:00:02.5."""
+    """Return a time of the recording as 1:02.5 or 1:00:02.5."""
     tenths = round(time_ns * 10 / SECOND)
     seconds, tenth = divmod(abs(tenths), 10)
     minutes, seconds = divmod(seconds, 60)
     hours, minutes = divmod(minutes, 60)
     text = f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
-    return f"{'−' if tenths < 0 else ''}{text}.{tenth}"
+    sign = "−" if tenths < 0 else ""
+    return f"{sign}{text}.{tenth}"
 
 
 def duration(length_ns: int) -> str:
-    """A length as 12.5 s, 4 min 05 s, 1 h 02 min 05 s, or 19675 days 17 h."""
+    """Return a duration as 12.5 s, 4 min 05 s, 1 h 02 min 05 s, or 19675 days 17 h."""
     if length_ns >= 100 * 3600 * SECOND:
         days, hours = divmod(round(length_ns / (3600 * SECOND)), 24)
         return f"{days} days {hours} h"
@@ -24,17 +25,18 @@ def duration(length_ns: int) -> str:
         return f"{length_ns / SECOND:.1f} s"
     minutes, seconds = divmod(round(length_ns / SECOND), 60)
     hours, minutes = divmod(minutes, 60)
-    text = f"{minutes:02} min" if hours else f"{minutes} min"
-    return f"{f'{hours} h ' if hours else ''}{text} {seconds:02} s"
+    if hours:
+        return f"{hours} h {minutes:02} min {seconds:02} s"
+    return f"{minutes} min {seconds:02} s"
 
 
 def number(value: float, digits: int) -> str:
-    """A number with a thin space between thousands and a minus sign."""
+    """Return a number with a minus sign and a thin space between thousands."""
     return f"{value:,.{digits}f}".replace(",", "\u202f").replace("-", "−")
 
 
 def wall_clock(wall_ns: int) -> str:
-    """Unix time as UTC."""
+    """Return a Unix time as UTC. Times that a date cannot express are returned in seconds."""
     try:
         return datetime.fromtimestamp(wall_ns // SECOND, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     except (OverflowError, OSError, ValueError):

@@ -1,7 +1,9 @@
-"""What is reported of one ESC: its measurements, which the core sends while they are fresh, and the errors that begin and end.
+"""Reports the measurements of one ESC, and the begin and end of its errors.
 
-Measurements are plans for slots of the core. Layouts as in the DSDL. What a device does not supply is NaN, or 0 where the type has no
-such thing; what is out of range is the limit (a throttle beyond 127 %, which no ESC sends, is 0).
+Measurements are plans for slots of the core, which sends them while they are fresh. The layouts are
+defined by the DSDL. A value that the device does not supply is NaN, or 0 if the type has no NaN. A
+value out of range is replaced by the limit, except a throttle beyond 127 %, which is replaced by 0.
+No ESC sends such a throttle.
 """
 
 import re
@@ -22,81 +24,159 @@ from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, Si
 from kontronik_can_gw.times import SECOND
 
 SPEEDS = {"motor": "motor_speed", "output": "output_speed", "electrical": "electrical_speed"}
-"""Key ``rpm`` of the configuration to the value that is sent."""
+"""The value to send for each choice of the configuration's key ``rpm``."""
 _QUIET_NS = 10 * SECOND
-"""A bit is logged at most this often."""
+"""Shortest interval between two log messages about one error bit."""
 _PARTS = re.compile(rf"\S(?:.{{0,{wire.MAX_TEXT - 1}}}(?!\S)|.{{0,{wire.MAX_TEXT - 1}}})")
-"""A text in parts that end with a word, where there is one; textwrap would be loaded for this alone."""
+"""Finds the parts of a text, which end between two words if possible.
+
+The module textwrap is not used, because it would be loaded only for this.
+"""
 _LEVELS = {Severity.ERROR: 3, Severity.WARNING: 2}
-MAX_RPM, MAX_ESC_INDEX = (1 << 17) - 1, 31
+MAX_RPM = (1 << 17) - 1
+MAX_ESC_INDEX = 31
 _KELVIN = Fraction("273.15")
-_MAX_HALF, _MAX_HALF_BITS, _NAN = 65504.0, 0x7BFF, 0x7E00
+# Numbers of 16-bit floats
+_MAX_HALF = 65504.0
+_MAX_HALF_BITS = 0x7BFF
+_NAN = 0x7E00
 _NO_BITS = 1 << 40
-"""What of an integer is not available: 0 at its place, and like no value."""
+"""Stands for an integer that is not available. It is sent as 0, and differs from every value."""
 _UNKNOWN_MOTOR_TEMPERATURE = -256
-"""StatusExtended has no such thing: what is certainly no temperature."""
+"""Sent because StatusExtended has no number for an unknown temperature. It is no real one."""
 
 
 class _Part(NamedTuple):
-    """A value in a message: from which bit on, how many; 16 are a float, 18 have a sign. Parts at one place are ORed."""
+    """A value in a message. Parts at the same position are combined by OR."""
 
     name: str
-    """Empty: the speed that the configuration chooses."""
+    """Empty for the speed that the configuration chooses."""
     at: int
+    """Position of the first bit."""
     bits: int
+    """Number of bits. 16 bits are a float, 18 bits are a signed integer."""
     slope: Fraction = Fraction(1)
     intercept: Fraction = Fraction(0)
     error: int | None = None
-    """What is sent instead of what is out of range; None: the greatest number."""
+    """Number that replaces a value out of range. None: the greatest number."""
     is_cut: bool = False
-    """Its low bits are sent."""
+    """True if only the low bits are sent."""
 
 
-_ANY_HIGHER = Fraction(1, 1 << 18), Fraction(-1, 2)
-"""Of the error word: 1 where a bit from the 18th on is set."""
-_LAYOUTS: Mapping[DataType, tuple[int, tuple[int, int], Sequence[_Part]]] = {
-    # bytes, place and bits of the index, values: without the first one there is no message
-    wire.STATUS: (14, (105, 5), (
-        _Part("", 80, 18), _Part("battery_voltage", 32, 16), _Part("battery_current", 48, 16),
-        _Part("power_stage_temperature", 64, 16), _Part("output_opening", 98, 7),
-    )),
-    wire.STATUS_EXTENDED: (7, (51, 5), (
-        _Part("output_opening", 7, 7), _Part("throttle", 0, 7, error=0), _Part("throttle", 0, 7, Fraction(-1), error=0),
-        _Part("operating_errors", 32, 19, is_cut=True), _Part("operating_errors", 48, 1, *_ANY_HIGHER),
-    )),
-    wire.CIRCUIT_STATUS: (7, (0, 16), (
-        _Part("bec_voltage", 16, 16), _Part("bec_current", 32, 16),
-        _Part("bec_overcurrent", 53, 1), _Part("bec_undervoltage", 54, 1), _Part("bec_overvoltage", 55, 1),
-    )),
-    wire.TEMPERATURE: (5, (0, 16), (_Part("bec_temperature", 16, 16), _Part("bec_overtemperature", 39, 1))),
-}  # fmt: skip
+class _Layout(NamedTuple):
+    """The layout of a message."""
+
+    length: int
+    """Number of bytes."""
+    index_bits: tuple[int, int]
+    """Position and number of bits of the ESC's index."""
+    parts: Sequence[_Part]
+    """The values. If the ESC does not supply the first one, the message is not sent."""
+
+
+_SLOPE_HIGHER = Fraction(1, 1 << 18)
+"""Slope that, with the intercept, is 1 if a bit from the 18th of the error word is set."""
+_INTERCEPT_HIGHER = Fraction(-1, 2)
+_LAYOUTS: Mapping[DataType, _Layout] = {
+    wire.STATUS: _Layout(
+        length=14,
+        index_bits=(105, 5),
+        parts=(
+            _Part("", 80, 18),
+            _Part("battery_voltage", 32, 16),
+            _Part("battery_current", 48, 16),
+            _Part("power_stage_temperature", 64, 16),
+            _Part("output_opening", 98, 7),
+        ),
+    ),
+    wire.STATUS_EXTENDED: _Layout(
+        length=7,
+        index_bits=(51, 5),
+        parts=(
+            _Part("output_opening", 7, 7),
+            _Part("throttle", 0, 7, error=0),
+            _Part("throttle", 0, 7, Fraction(-1), error=0),
+            _Part("operating_errors", 32, 19, is_cut=True),
+            _Part("operating_errors", 48, 1, _SLOPE_HIGHER, _INTERCEPT_HIGHER),
+        ),
+    ),
+    wire.CIRCUIT_STATUS: _Layout(
+        length=7,
+        index_bits=(0, 16),
+        parts=(
+            _Part("bec_voltage", 16, 16),
+            _Part("bec_current", 32, 16),
+            _Part("bec_overcurrent", 53, 1),
+            _Part("bec_undervoltage", 54, 1),
+            _Part("bec_overvoltage", 55, 1),
+        ),
+    ),
+    wire.TEMPERATURE: _Layout(
+        length=5,
+        index_bits=(0, 16),
+        parts=(
+            _Part("bec_temperature", 16, 16),
+            _Part("bec_overtemperature", 39, 1),
+        ),
+    ),
+}
 
 
 @cache
 def plans_of(protocol: EscProtocol, speed: str, has_direction: bool) -> Mapping[DataType, SlotPlan]:
-    """The messages that an ESC of this protocol supplies.
+    """Return the messages that an ESC of this protocol supplies.
 
-    ``speed`` is the value that is sent as rpm, negative while the motor turns backward if
-    ``has_direction``.
+    ``speed`` is the value that is sent as rpm. With ``has_direction``, it is negative while the
+    motor turns backward.
     """
-    values, found = values_of(protocol), {}
-    rpm = with_direction(protocol, values[speed]) if has_direction else values[speed]
-    for kind, (length, _, parts) in _LAYOUTS.items():
-        signals = tuple(_signal(part, values[part.name] if part.name else rpm) for part in parts)
+    values = values_of(protocol)
+    rpm = values[speed]
+    if has_direction:
+        rpm = with_direction(protocol, rpm)
+    found = {}
+    for kind, layout in _LAYOUTS.items():
+        signals = tuple(
+            _signal(part, values[part.name] if part.name else rpm) for part in layout.parts
+        )
         if signals[0].source is None or not signals[0].source.supplied:
             continue
-        plan = MessagePlan(
-            *("transfer", 0, True, False, length, SendType.EVENT, 0, 0, signals),
-            *(frozenset({0}), frozenset({Group.LIVE})),
-        )
-        pack = compile_pack(plan)
-        found[kind] = SlotPlan(plan, pack, Event.LIVE, 0, None, False, "", kind.seed, True)
+        found[kind] = _slot_plan(kind, layout.length, signals)
     return found
 
 
+def _slot_plan(kind: DataType, length: int, signals: tuple[SignalPlan, ...]) -> SlotPlan:
+    plan = MessagePlan(
+        name="transfer",
+        can_id=0,
+        extended=True,
+        fd=False,
+        length=length,
+        send_type=SendType.EVENT,
+        cycle_ns=0,
+        delay_ns=0,
+        compiled=signals,
+        escs=frozenset({0}),
+        paces=frozenset({Group.LIVE}),
+    )
+    return SlotPlan(
+        message=plan,
+        pack=compile_pack(plan),
+        triggers=Event.LIVE,
+        watched=0,
+        pack_watched=None,
+        needs_live=False,
+        seed=kind.seed,
+        paced=True,
+    )
+
+
 def fill(kind: DataType, index: int, errors: int) -> int:
-    """The bits of a message that are no value of the ESC. ``errors``: since the motor was started."""
-    found = place(pieces(*_LAYOUTS[kind][1]), index)
+    """Return the bits of a message that are not values of the ESC.
+
+    ``errors`` is the number of errors since the motor was started.
+    """
+    position, bits = _LAYOUTS[kind].index_bits
+    found = place(pieces(position, bits), index)
     if kind is wire.STATUS:
         found |= errors & 0xFFFF_FFFF
     elif kind is wire.STATUS_EXTENDED:
@@ -105,7 +185,10 @@ def fill(kind: DataType, index: int, errors: int) -> int:
 
 
 def pieces(at: int, bits: int) -> tuple[Piece, ...]:
-    """Where a number is, from bit ``at`` of the message on: its low byte first, in each byte the most significant bit."""
+    """Return the pieces of a number that begins at bit ``at`` of the message.
+
+    The low byte is first, and in each byte the most significant bit is first.
+    """
     whole = 0 if at % 8 else bits // 8 * 8
     found = [Piece(0, whole, at)] if whole else []
     at += whole
@@ -120,27 +203,42 @@ def pieces(at: int, bits: int) -> tuple[Piece, ...]:
 
 
 def _signal(part: _Part, value: Value) -> SignalPlan:
-    is_float, signed = part.bits == 16, part.bits == 18
-    intercept, not_available, error = part.intercept, _NO_BITS, part.error
-    high = 0xFFFF_FFFF if part.is_cut else (1 << part.bits - signed) - 1
+    is_float = part.bits == 16
+    is_signed = part.bits == 18
+    high = (1 << part.bits - is_signed) - 1
+    if part.is_cut:
+        high = 0xFFFF_FFFF
+    intercept = part.intercept
+    not_available = _NO_BITS
+    error = high if part.error is None else part.error
     if is_float:
-        not_available, error = _NAN, _MAX_HALF_BITS
-        intercept = _KELVIN if value.unit == "°C" else intercept
+        not_available = _NAN
+        error = _MAX_HALF_BITS
+        if value.unit == "°C":
+            intercept = _KELVIN
     return SignalPlan(
-        *(part.name, value.unit, Role.SOURCE, high.bit_length() + signed, signed, is_float),
-        *(pieces(part.at, part.bits), -high - 1 if signed else 0, high),
-        *(not_available, high if error is None else error),
+        name=part.name,
+        unit=value.unit,
+        role=Role.SOURCE,
+        length=high.bit_length() + is_signed,
+        signed=is_signed,
+        is_float=is_float,
+        pieces=pieces(part.at, part.bits),
+        low=-high - 1 if is_signed else 0,
+        high=high,
+        not_available=not_available,
+        error=error,
         slope=part.slope / value.per_unit,
         intercept=intercept,
         source=value,
         esc=0,
-        saturates=signed,
+        saturates=is_signed,
         limits=(-_MAX_HALF, _MAX_HALF),
     )
 
 
 class EscReport:
-    """One ESC with its index on the bus. ``table``: of the configuration."""
+    """One ESC with its index on the bus. ``table`` is the configuration's table [dronecan]."""
 
     def __init__(self, esc: EscTelemetry, index: int, table: Any) -> None:
         self.esc = esc
@@ -153,18 +251,27 @@ class EscReport:
         }
         self._plans = plans_of(esc.protocol, SPEEDS[table.rpm], table.negative_rpm)
         self._slots: dict[wire.DataType, Slot] = {}
-        self._node_id = self._page = 0
+        self._node_id = 0
+        self._page = 0
         values = values_of(esc.protocol)
-        self._word, self._speed = values["operating_errors"], values["electrical_speed"]
+        self._word = values["operating_errors"]
+        self._speed = values["electrical_speed"]
         self._bits = [
             bit
             for bit in esc.protocol.errors.get("operating_errors", ())
             if bit.severity in _LEVELS and not bit.is_summary
         ]
         self._errors = sum(1 << bit for bit in self._bits if bit.severity is Severity.ERROR)
-        self._before = self._logged = self._onsets = 0
+        """The bits of errors in the word."""
+        self._before = 0
+        """The word at the last call of ``follow``."""
+        self._logged = 0
+        """The bits whose begin was logged, and whose end was not."""
+        self._onsets = 0
+        """Number of errors since the motor was started."""
         self._turns = False
         self._quiet_until: dict[int, int] = {}
+        """Time until which a bit is not logged again."""
 
     # --- measurements
 
@@ -173,20 +280,21 @@ class EscReport:
         self._slots = {kind: slot() for kind in self._plans if self._rates[kind]}
 
     def start(self, node_id: int, place: int, now: int) -> None:
-        """Send measurements as this node; ``place`` of the ESC among its."""
-        self._node_id, self._page = node_id, FIRST_PART + PARTS * place
+        """Send measurements as this node. ``place`` is the ESC's position among the node's ESCs."""
+        self._node_id = node_id
+        self._page = FIRST_PART + PARTS * place
         self._configure(now)
         for slot in self._slots.values():
             slot.start(now)
 
     def stop(self) -> None:
-        """Send none any more."""
+        """Stop sending measurements."""
         for slot in self._slots.values():
             slot.stop()
 
     @property
     def status_sent(self) -> int:
-        """esc.Status so far."""
+        """Number of sent esc.Status messages."""
         slot = self._slots.get(wire.STATUS)
         return 0 if slot is None else slot.sent
 
@@ -195,34 +303,44 @@ class EscReport:
             period = SECOND // self._rates[kind]
             can_id = message_id(kind.number, self._node_id, LOW)
             bits = fill(kind, self.index, self._onsets)
-            times = period * 3 // 4, period * 5 // 4
-            slot.configure(
-                SlotSettings(self._plans[kind], can_id, True, *times, bits, self._page), now
+            settings = SlotSettings(
+                plan=self._plans[kind],
+                can_id=can_id,
+                by_event=True,
+                inhibit_ns=period * 3 // 4,
+                timer_ns=period * 5 // 4,
+                fill=bits,
+                page=self._page,
             )
+            slot.configure(settings, now)
 
     # --- errors
 
     @property
     def word(self) -> int:
-        """The operating errors; 0 while they are not known."""
+        """The operating errors. 0 if unknown."""
         return steps_of(self._word, self.esc, self.esc.live) or 0
 
     @property
     def health(self) -> int:
-        """Of the ESC, as NodeStatus has it."""
+        """The health of the ESC, as in NodeStatus."""
         word = self.word
         if word & self._errors:
             return wire.ERROR
-        is_well = self.esc.up and not any(word >> bit & 1 for bit in self._bits)
-        return wire.OK if is_well else wire.WARNING
+        has_bits = any(word >> bit & 1 for bit in self._bits)
+        return wire.WARNING if has_bits or not self.esc.up else wire.OK
 
     def follow(self, events: int, now: int) -> None:
-        """Count errors that begin; not those of the link's return, which may be old. ``events``: bits of Event, or each second none."""
-        onsets, word = self._onsets, self.word
+        """Count errors that have begun. ``events`` are bits of Event, or 0 once a second.
+
+        Errors that exist when the link returns are not counted, because they may be old.
+        """
+        onsets = self._onsets
+        word = self.word
         if self.esc.up:
             turns = bool(steps_of(self._speed, self.esc, self.esc.live))
             if turns and not self._turns:
-                self._onsets = 0  # errors since the motor was started
+                self._onsets = 0  # the motor was started
             self._turns = turns
         if not events & Event.LINK:
             self._onsets += (word & ~self._before & self._errors).bit_count()
@@ -231,7 +349,10 @@ class EscReport:
             self._configure(now)
 
     def log(self, now: int) -> Iterator[bytes]:
-        """LogMessages of an error or warning that has begun or ended; of one at a time, and none of what is not known now."""
+        """Yield the LogMessages of an error or warning that has begun or ended.
+
+        Each call yields the messages of at most one. While the errors are unknown, it yields none.
+        """
         if not self.esc.up:
             return
         word = self.word
@@ -243,15 +364,18 @@ class EscReport:
                 yield from self._texts(bit, bool(word & mask))
                 return
 
-    def log_anew(self) -> None:
-        """Log what is on once more: what was logged may never have reached the bus."""
+    def log_again(self) -> None:
+        """Log the present errors again, because the messages may not have reached the bus."""
         self._logged = 0
 
     def _texts(self, bit: ErrorBit, begins: bool) -> Iterator[bytes]:
         name = self.esc.settings.name
-        level, text = _LEVELS[bit.severity], f"{name}: {bit.meaning}. {bit.remedy}"
-        if not begins:
-            level, text = 1, f"{name}: over: {bit.meaning}"
+        if begins:
+            level = _LEVELS[bit.severity]
+            text = f"{name}: {bit.meaning}. {bit.remedy}"
+        else:
+            level = 1
+            text = f"{name}: over: {bit.meaning}"
         source = name.encode("ascii", "replace")
         head = wire.LOG_MESSAGE.pack(level << 5 | len(source)) + source
         for part in _PARTS.findall(text):

@@ -1,6 +1,6 @@
-"""The DroneCAN output: the gateway's node, or one for each ESC.
+"""The DroneCAN output: one node for the gateway, or one for each ESC, on one bus.
 
-A node reports its own status and answers requests. The core sends the measurements of its ESCs.
+A node sends its status and log messages, and answers requests.
 """
 
 import struct
@@ -23,47 +23,49 @@ from kontronik_can_gw.times import NEVER, SECOND
 SERVICES = {kind.number: kind for kind in (wire.GET_NODE_INFO, wire.RESTART_NODE, wire.GET_SET)}
 _HARDWARE = (1, 0)
 _VALUE_SIZES = (0, 8, 4, 1)
-"""Bytes of a parameter's value, by the tag of its union: empty, integer, real, boolean."""
+"""Length of a parameter's value by the tag of its union: none, integer, real, boolean."""
 _STRING = 4
+"""Tag of a string."""
 Parameter = int | float | str
 MAX_ANSWERS = 50
-"""Maximum number of answers per second, so that requests cannot fill the bus."""
+"""Maximum number of answers in a second, so that requests cannot keep the bus busy."""
 _ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
-"""Ids of Allocation messages: of an allocator, and of other nodes that ask for a node-ID."""
+"""Ids of Allocation messages: those of an allocator, and the requests of other clients."""
 
 
 class Node:
-    """One node. While its ``node_id`` is 0 it waits for one and is silent."""
+    """One DroneCAN node of the gateway."""
 
     def __init__(self, setup: NodeSetup, given: Given, reports: Sequence[EscReport]) -> None:
         self.setup = setup
         self.node_id = setup.node_id
+        """0 while the node waits for a node-ID. It sends no messages then."""
         self.reports = [reports[number] for number in setup.escs]
         self.is_duplicate = False
-        """True while another device sends with this node-ID."""
+        """True if another device sends with this node-ID."""
         self._table = given.table
         self._version = given.version
         self._transfer_ids: dict[int, int] = {}
 
     def start(self, now: int) -> None:
-        """Let the core send the measurements of its ESCs, because it has its node-ID."""
+        """Let the core send the measurements of the node's ESCs. The node must have a node-ID."""
         for place, report in enumerate(self.reports):
             report.start(self.node_id, place, now)
 
     def message(
         self, kind: DataType, payload: bytes, queued: bool = False, priority: int = wire.LOW
     ) -> list[CanFrame]:
-        """Return the frames of a broadcast message. ``queued`` as in ``CanFrame``."""
+        """Return the frames of a broadcast message. ``queued`` as in CanFrame."""
         count = self._transfer_ids.get(kind.number, 0)
         self._transfer_ids[kind.number] = count + 1 & TRANSFER_ID
         can_id = wire.message_id(kind.number, self.node_id, priority)
         return transfer(can_id, kind.seed, payload, count, queued)
 
     def status(self, uptime_s: int, mode: int, bus_is_well: bool) -> bytes:
-        """Return a NodeStatus.
+        """Return the payload of NodeStatus.
 
-        The health of the ESCs is included only if it is configured, because an autopilot does not
-        arm while a node is not healthy.
+        The health of the ESCs is included only if the user has chosen it, because an autopilot does
+        not arm while the health of a node is not OK.
         """
         health = wire.OK if bus_is_well and not self.is_duplicate else wire.WARNING
         code = 0
@@ -76,13 +78,13 @@ class Node:
     def answer(
         self, request_id: int, kind: DataType, request: bytes, transfer_id: int, status: bytes
     ) -> list[CanFrame]:
-        """Return the frames of the response, or none if the request is invalid.
+        """Return the frames of the response to a request. Empty if the request is malformed.
 
-        ``request_id`` is the CAN id of the request, ``status`` the current NodeStatus.
+        ``request_id`` is the CAN id of the request, and ``status`` the node's present NodeStatus.
         """
         if kind is wire.GET_NODE_INFO:
-            versions = *self._version, 0, 0, 0, *_HARDWARE
-            answer = wire.GET_NODE_INFO.pack(status, *versions, self.setup.unique_id, 0)
+            software = (*self._version, 0, 0, 0)
+            answer = wire.GET_NODE_INFO.pack(status, *software, *_HARDWARE, self.setup.unique_id, 0)
             answer += self.setup.name.encode("ascii")
         elif kind is wire.GET_SET:
             answer = _get_set(request, self._parameters())
@@ -97,7 +99,8 @@ class Node:
         found: dict[str, Parameter]
         found = {name: getattr(table, name) for name in ("rate_hz", "extended_hz", "rpm")}
         for report in self.reports:
-            esc, name = report.esc, report.esc.settings.name
+            esc = report.esc
+            name = esc.settings.name
             found[f"{name}.esc_index"] = report.index
             found[f"{name}.pole_pairs"] = esc.pole_pairs
             gear = esc.output_divisor / (esc.pole_pairs * esc.gear_denominator)
@@ -106,32 +109,36 @@ class Node:
 
 
 def _get_set(request: bytes, parameters: dict[str, Parameter]) -> bytes:
-    """Return the response of param.GetSet, or b"" if the request is invalid.
+    """Return the response of param.GetSet. Empty if the request is malformed.
 
-    The parameter is found by name, or by index if the name is empty. Nothing can be set.
+    The parameter is selected by the name in the request, or by the index if the name is empty. A
+    value in the request is ignored, because parameters can only be read.
     """
     if len(request) < 2:
         return b""
-    index, tag = request[0] | request[1] >> 3 << 8, request[1] & 7
+    index = request[0] | request[1] >> 3 << 8
+    tag = request[1] & 7
+    if tag > _STRING:
+        return b""
     if tag == _STRING:
         start = 3 + int.from_bytes(request[2:3])
     else:
-        start = 2 + _VALUE_SIZES[tag] if tag < _STRING else len(request) + 1
+        start = 2 + _VALUE_SIZES[tag]
     if len(request) < start:
         return b""
     name = request[start:].decode("latin-1")
-    if not name:
-        name = next(iter([*parameters][index : index + 1]), "")
+    if not name and index < len(parameters):
+        name = list(parameters)[index]
     value = parameters.get(name)
-    # Without default and limits, because it cannot be set.
     if value is None:
         return bytes(4)
     if isinstance(value, str):
         packed = bytes((_STRING, len(value))) + value.encode("ascii")
+    elif isinstance(value, int):
+        packed = struct.pack("<Bq", 1, value)
     else:
-        packed = struct.pack(
-            "<Bq" if isinstance(value, int) else "<Bf", 2 - isinstance(value, int), value
-        )
+        packed = struct.pack("<Bf", 2, value)
+    # The default and the limits are empty, because the parameter cannot be set.
     return packed + bytes(3) + name.encode("ascii")
 
 
@@ -152,14 +159,20 @@ class Dronecan(Output):
             self._reports.append(report)
         self._nodes = [Node(setup, given, self._reports) for setup in setups]
         self._by_id: dict[int, Node] = {}
+        """The nodes that have a node-ID."""
         self._allocation = Allocation(given.seed)
         self._assembler = Assembler()
-        self._answered = self._unanswered = self._answers = 0
+        self._answered = 0
+        """Number of answered requests since the start."""
+        self._unanswered = 0
+        """Number of requests that exceeded MAX_ANSWERS."""
+        self._answers = 0
+        """Number of answers in the present second."""
         self._second_due = NEVER
         self._news: list[LogLine] = []
         self._follow_ids()
 
-    # --- what happens
+    # --- calls of the gateway, see Output
 
     def start(self, now: int, can_open: bool) -> None:
         self.repeat_measurements(now)
@@ -171,15 +184,15 @@ class Dronecan(Output):
         for report in self._reports:
             report.stop()
         for node in self._by_id.values():
-            self._say_node_status(node, now, wire.OFFLINE)
+            self._send_node_status(node, now, wire.OFFLINE)
 
     def can_returned(self, now: int) -> None:
-        self._log_anew()
+        self._log_again()
         self.repeat_measurements(now)
 
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
         if before is CanState.BUS_OFF and state not in (CanState.BUS_OFF, CanState.DOWN):
-            self._log_anew()
+            self._log_again()
 
     def repeat_measurements(self, now: int) -> None:
         self._second_due = now
@@ -196,11 +209,12 @@ class Dronecan(Output):
     def advance(self, now: int) -> None:
         if now >= self._allocation.due:
             self.frames += self._allocation.advance(now)
-        if now >= (due := self._second_due):
-            self._second_due = SECOND + (
-                now if now - due >= SECOND else due
-            )  # missed ones are skipped
-            self._say_second(now)
+        due = self._second_due
+        if now >= due:
+            # Missed seconds are skipped.
+            has_missed = now - due >= SECOND
+            self._second_due = SECOND + (now if has_missed else due)
+            self._send_second(now)
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
         if not frame.extended or frame.remote or frame.fd:
@@ -212,7 +226,8 @@ class Dronecan(Output):
             if number == wire.ALLOCATION.number and self._allocation.due != NEVER:
                 self._take_allocation(frame, source, now)
             return
-        node, kind = self._by_id.get(can_id >> 8 & NODE), SERVICES.get(can_id >> 16 & 0xFF)
+        node = self._by_id.get(can_id >> 8 & NODE)
+        kind = SERVICES.get(can_id >> 16 & 0xFF)
         if node is None or kind is None or not can_id & REQUEST or not source:
             return
         request = self._assembler.receive(can_id, frame.data, kind.seed, now)
@@ -221,14 +236,16 @@ class Dronecan(Output):
         if self._answers >= MAX_ANSWERS:
             self._unanswered += 1
             return
-        transfer_id, status = frame.data[-1] & TRANSFER_ID, self._status_of(node, now)
-        if answer := node.answer(can_id, kind, request, transfer_id, status):
+        transfer_id = frame.data[-1] & TRANSFER_ID
+        status = self._status_of(node, now)
+        answer = node.answer(can_id, kind, request, transfer_id, status)
+        if answer:
             self._answers += 1
             self._answered += 1
             self.frames += answer
 
     def own_ids(self) -> dict[int, Owner]:
-        """Return the blocks of ids whose source is one of our nodes."""
+        """Return the ids that have one of our nodes as their source."""
         return {
             id_block(node.node_id, NODE): Owner(number, f"DroneCAN node-ID {node.node_id}")
             for number, node in enumerate(self._nodes)
@@ -240,9 +257,12 @@ class Dronecan(Output):
         return news
 
     def facts(self) -> dict[str, Any]:
-        nodes, lines = [], []
+        nodes = []
+        lines = []
         for node in self._nodes:
-            state = "another device has this node-ID" if node.is_duplicate else "operational"
+            state = "operational"
+            if node.is_duplicate:
+                state = "another device has this node-ID"
             if not node.node_id:
                 state = f"waits for a node-ID, {self._allocation.requests} requests"
             name = node.setup.name
@@ -258,23 +278,24 @@ class Dronecan(Output):
             "node_ids_refused": self._allocation.refused,
         }
 
-    # --- what is said
+    # --- messages
 
-    def _say_second(self, now: int) -> None:
+    def _send_second(self, now: int) -> None:
+        """Send the messages of each second."""
         self._answers = 0
         for report in self._reports:
             report.follow(0, now)
         for node in self._by_id.values():
-            self._say_node_status(node, now)
+            self._send_node_status(node, now)
             for report in node.reports if self._table.log_messages else ():
                 for message in report.log(now):
                     self.frames += node.message(wire.LOG_MESSAGE, message, queued=True)
 
-    def _log_anew(self) -> None:
+    def _log_again(self) -> None:
         for report in self._reports:
-            report.log_anew()
+            report.log_again()
 
-    def _say_node_status(self, node: Node, now: int, mode: int = wire.OPERATIONAL) -> None:
+    def _send_node_status(self, node: Node, now: int, mode: int = wire.OPERATIONAL) -> None:
         status = self._status_of(node, now, mode)
         self.frames += node.message(wire.NODE_STATUS, status, priority=wire.LOWEST)
 
@@ -306,7 +327,7 @@ class Dronecan(Output):
             self._ask(now)
 
     def _follow_ids(self) -> None:
-        """Compute the ids to receive from the node-IDs."""
+        """Update the ids to receive after a change of node-IDs."""
         self._by_id = {node.node_id: node for node in self._nodes if node.node_id}
         requests = SERVICE | REQUEST
         mask = requests | NODE << 8

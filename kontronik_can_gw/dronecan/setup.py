@@ -58,23 +58,24 @@ class DronecanSetup(OutputSetup):
         if not table.per_esc_nodes:
             numbers = tuple(range(len(self.escs)))
             return (NodeSetup(first, table.name, self._unique_id(table.name), numbers),)
-        nodes = []
+        found = []
         for number, esc in enumerate(self.escs):
             name = f"{table.name}.{esc.name.lower()}"
             node_id = first + number if first else 0
-            nodes.append(NodeSetup(node_id, name, self._unique_id(name), (number,)))
-        return tuple(nodes)
+            found.append(NodeSetup(node_id, name, self._unique_id(name), (number,)))
+        return tuple(found)
 
     def _unique_id(self, name: str) -> bytes:
-        """Return the unique id, which depends on the machine and the name of the node.
+        """Return the unique id of a node, which is always the same for this machine and name.
 
-        Ids of different nodes differ in their first bytes, because an allocator asks for them in
-        parts.
+        The unique ids of other nodes differ already in the first bytes, because an allocator is
+        asked with a part of the id.
         """
         machine = self.given.identity
-        node = name.encode()
-        checks = crc32(machine + node).to_bytes(4, "big") + crc32(node).to_bytes(4, "big")
-        return checks + machine[:8].ljust(8, b"\0")
+        name_bytes = name.encode()
+        both_check = crc32(machine + name_bytes).to_bytes(4, "big")
+        name_check = crc32(name_bytes).to_bytes(4, "big")
+        return both_check + name_check + machine[:8].ljust(8, b"\0")
 
     def make(self, host: OutputHost, now: int) -> Dronecan:
         return Dronecan(self.nodes, self.given, host)
@@ -85,9 +86,9 @@ class DronecanSetup(OutputSetup):
         return given._asdict() | {"table": table, "identity": identity}
 
     def taken_ids(self) -> Mapping[int, str]:
-        """Return the blocks of ids that are frames of our nodes.
+        """Return the ids of all possible frames of our nodes.
 
-        If an allocator chooses the node-ID, that is every 29-bit id.
+        While a node-ID is unknown, these are all ids.
         """
         if not self.given.table.node_id:
             return {id_block(0, 0): "DroneCAN, whose node-ID an allocator chooses"}
@@ -117,14 +118,14 @@ class DronecanSetup(OutputSetup):
         table = self.given.table
         if table.rate_hz < _LOWEST_RATE_HZ:
             found.append(
-                f"dronecan.rate_hz is {table.rate_hz}: below {_LOWEST_RATE_HZ} "
-                "ArduPilot may take a running motor for stopped. "
+                f"dronecan.rate_hz is {table.rate_hz}: "
+                f"below {_LOWEST_RATE_HZ} ArduPilot may take a running motor for stopped. "
                 f"Set it to {_LOWEST_RATE_HZ} or more"
             )
         if table.extended_hz:
             found.append(
-                "dronecan.extended_hz: the motor temperature in esc.StatusExtended "
-                "is not known and sent as -256 degC, which PX4 takes for the temperature. "
+                "dronecan.extended_hz: the motor temperature in esc.StatusExtended is not known "
+                "and sent as -256 degC, which PX4 takes for the temperature. "
                 "Set extended_hz = 0 for PX4"
             )
         if not self.given.identity:
@@ -136,8 +137,7 @@ class DronecanSetup(OutputSetup):
         if plain and table.rpm != "electrical":
             found.append(
                 f"dronecan: rpm of {', '.join(plain)} is sent as with one pole pair: "
-                "set pole_pairs in [[esc]], "
-                'or dronecan.rpm = "electrical" if it is one'
+                'set pole_pairs in [[esc]], or dronecan.rpm = "electrical" if it is one'
             )
         return [f"{file}: {text}" for text in found]
 

@@ -246,7 +246,8 @@ class EscProtocol:
     wire: tuple[tuple[str, type[tuple[int, ...]]], ...] | None = None
     """struct codes in wire order, and data type, of live data and then of info data.
 
-    None if the C core cannot decode the protocol.
+    None if the C core cannot decode the protocol. It decodes only the frames that
+    ``esc/kontronik/c_header.py`` describes.
     """
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The shared object of the core in C by ctypes: no Python headers, no callbacks."""
+"""Loads the shared object of the core in C through ctypes, without Python headers or callbacks."""
 
 import ctypes as c
 import struct
@@ -12,41 +12,56 @@ from kontronik_can_gw.native.objects import source_number
 Frame = structure("kcg_frame")
 _FRAME_SIZE = c.sizeof(Frame)
 _SIZED = (
-    *("signal", "message", "settings", "plan", "esc", "frame"),
-    *("offline", "column", "cell", "turns"),
+    "kcg_signal",
+    "kcg_message",
+    "kcg_settings",
+    "kcg_plan",
+    "kcg_esc",
+    "kcg_frame",
+    "kcg_offline",
+    "kcg_column",
+    "kcg_cell",
+    "kcg_turns",
 )
-"""In the order of kcg_sizes, kcg_offline_sizes and kcg_turns_size."""
+"""Structures in the order of kcg_sizes, kcg_offline_sizes and kcg_turns_size."""
+_IN_CORE, _IN_OFFLINE = 6, 3
+"""Number of structures whose sizes kcg_sizes and kcg_offline_sizes return."""
 _head = struct.Struct("=IBBB").unpack_from
 _new = tuple.__new__
 
 
 class WrongObject(RuntimeError):
-    """A shared object that is not of this version, or not for this machine: the message says which."""
+    """The shared object is from another version or for another machine. The message tells which."""
 
 
 def load(path: Path) -> Any:
-    """The shared object with its functions declared. WrongObject where it cannot be used."""
+    """Return the shared object with its functions declared. Raises WrongObject if it does not fit."""
     try:
         library: Any = c.PyDLL(str(path))  # other threads of Python run only while a turn waits
-        library.kcg_turn = c.CDLL(str(path)).kcg_turn
+        released: Any = c.CDLL(str(path))
+        library.kcg_turn = released.kcg_turn
         for name, (result, *arguments) in functions():
             function = getattr(library, name)
             function.restype, function.argtypes = result, arguments
     except (OSError, AttributeError) as error:
         raise WrongObject(f"{path.name}: {error}") from None
-    its = [library.kcg_sizes(number) for number in range(7)]
-    its += [*map(library.kcg_offline_sizes, range(3)), library.kcg_turns_size()]
-    if its != [source_number(), *(c.sizeof(structure(f"kcg_{name}")) for name in _SIZED)]:
+    sizes = [library.kcg_sizes(1 + number) for number in range(_IN_CORE)]
+    sizes += [library.kcg_offline_sizes(number) for number in range(_IN_OFFLINE)]
+    sizes.append(library.kcg_turns_size())
+    expected = [c.sizeof(structure(name)) for name in _SIZED]
+    if library.kcg_sizes(0) != source_number() or sizes != expected:
         raise WrongObject(f"{path.name}: made of other sources than these")
     return library
 
 
 def frames_in(raw: memoryview, begin: int, count: int) -> list[CanFrame]:
-    """As CanFrames: ``count`` of kcg_frame in memory from ``begin`` on."""
+    """Return ``count`` frames (kcg_frame) in memory, from offset ``begin``, as CanFrames."""
     frames = []
     for at in range(begin, begin + count * _FRAME_SIZE, _FRAME_SIZE):
         number, length, flags, page = _head(raw, at)
         data = bytes(raw[at + 8 : at + 8 + length])
-        of = (number & ~EXTENDED, data, number >= EXTENDED, flags != 0, page, False, False)
-        frames.append(_new(CanFrame, of))
+        can_id = number & ~EXTENDED
+        is_extended = number >= EXTENDED
+        fields = (can_id, data, is_extended, flags != 0, page, False, False)
+        frames.append(_new(CanFrame, fields))
     return frames

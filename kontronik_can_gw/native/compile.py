@@ -1,14 +1,27 @@
-"""Compiles the core in C: hatch_build.py at the installation, ``python -m kontronik_can_gw.native.compile`` after an edit."""
+"""Compiles the core in C.
+
+hatch_build.py does it at the installation, before the package is installed and with the standard
+library only. After an edit of the C sources or of esc/kontronik/fields.py run
+``python -m kontronik_can_gw.native.compile``.
+"""
 
 import contextlib
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.native.objects import OPTIONS, sealed, shared_object, source_number, sources
+from kontronik_can_gw.native.objects import (
+    OPTIONS,
+    sealed,
+    shared_object,
+    source_number,
+    sources,
+    wire_header,
+)
 
 _LIMIT_S = 120
 _OPTIMISED = ("-O2", *OPTIONS)
@@ -28,28 +41,53 @@ OF_NO_LIBRARY = (
     "-fno-stack-protector",
     "-lgcc",
 )
-"""Linked with nothing: the process that loads it has a libc, of whichever kind and version (of 32 bits, with its oldest time_t)."""
+"""Options that link no library, so that the object suits every C library and version.
+
+The process that loads it has a libc. On 32-bit machines the object uses its oldest time_t.
+"""
 
 
 def compiler() -> str | None:
-    """The machine's C compiler."""
+    """Return the path of the machine's C compiler, or None."""
     return shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 
 def compile_core(
     target: Path, options: Sequence[str] = _OPTIMISED, program: str | None = None
 ) -> str | None:
-    """Make the shared object; None, or why it could not be made, in one line. ``program``: the compiler, else the machine's."""
+    """Make the shared object. Return None, or in one line why it could not be made.
+
+    ``program`` is the compiler. Without it the machine's compiler is used.
+    """
     program = program or compiler()
     if program is None:
         return "there was no C compiler at the installation"
     named = f"at the installation {program} failed"
     part = target.with_name(f"{target.name}.part")
-    command = [program, "-std=c99", "-fwrapv", "-fPIC", "-shared", "-o", str(part)]
-    command += [f"-DKCG_SOURCE={source_number()}"]
-    command += [str(source) for source in sources() if source.suffix == ".c"]
     try:
-        done = subprocess.run(
+        done = _run(program, options, part)
+        if done.returncode:
+            lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+            first_error = next((line for line in lines if "error" in line), lines[0])
+            return f"{named}: {first_error}"
+        part.write_bytes(sealed(part.read_bytes()))
+        part.replace(target)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"{named}: {error}"
+    finally:
+        with contextlib.suppress(OSError):  # a read-only file system, even without the file
+            part.unlink()
+    return None
+
+
+def _run(program: str, options: Sequence[str], target: Path) -> subprocess.CompletedProcess[str]:
+    """Run the compiler with the generated wire.h in a folder of its own."""
+    with tempfile.TemporaryDirectory(prefix="kcg-wire.") as folder:
+        (Path(folder) / "wire.h").write_text(wire_header(), encoding="ascii")
+        command = [program, "-std=c99", "-fwrapv", "-fPIC", "-shared", "-o", str(target)]
+        command += ["-I", folder, f"-DKCG_SOURCE={source_number()}"]
+        command += [str(source) for source in sources() if source.suffix == ".c"]
+        return subprocess.run(
             [*command, *options],
             capture_output=True,
             text=True,
@@ -58,19 +96,6 @@ def compile_core(
             timeout=_LIMIT_S,
             env=os.environ | {"LC_ALL": "C"},
         )
-        if done.returncode:
-            lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-            return f"{named}: {next((line for line in lines if 'error' in line), lines[0])}"
-        part.write_bytes(sealed(part.read_bytes()))
-        part.replace(target)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        return f"{named}: {error}"
-    finally:
-        with contextlib.suppress(
-            OSError
-        ):  # of a file system that is read-only even where it is not there
-            part.unlink()
-    return None
 
 
 if __name__ == "__main__":

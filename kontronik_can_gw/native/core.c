@@ -6,15 +6,30 @@
 #define INFO_TIMEOUT (10 * SECOND)
 #define MIN_DISTANCE INT64_C(1000000)
 #define LONG_AGO (-(INT64_C(1) << 61))
-enum { LONGER_COVERED = 34 };                /* all bytes before the CRC of a legacy live frame; twin: deframer.has_longer_crc */
-enum { CYCLE = 1, REQUEST = 2, TURNED = 4 }; /* why a message is pending; its page was turned */
-enum { KNOWN = 1, TO_SEND = 2 };             /* of a page: its last frame is known; it follows without an event */
-enum { STARTED = 1, NEWS = 2, SEEN = 4 };    /* of a slot: it has changed since its last frame; its watched bits are known */
-enum { VOLTAGE_AT = 4, CURRENT_AT = 6, ERRORS_AT = 24, STATE_AT = 28, CELLS_AT = 8, LARGEST_STATE = 26, WORDS = (KCG_DATA + 7) / 8 };
-#define PAGES_OF(m) (KCG_PAGED ? (m)->pages : 1)
-#define WORDS_OF(m) (WORDS == 1 ? 1u : (m)->words) /* of 64 bits, that a frame has */
 
-/* --- CRC-32 ---------------------------------------------------------------------------------------------------------- */
+/* kcg_sending.why. */
+enum {
+    CYCLE = 1,
+    REQUEST = 2,
+    TURNED = 4 /* The page of this cycle was chosen. */
+};
+/* kcg.page. */
+enum {
+    KNOWN = 1,  /* The bits of its last frame are in kcg.last. */
+    TO_SEND = 2 /* It must be sent without a further event. */
+};
+/* kcg_slot.state. */
+enum {
+    STARTED = 1,
+    NEWS = 2, /* The content has changed since the last frame. */
+    SEEN = 4  /* seen_bits is valid. */
+};
+/* 64-bit words of the largest frame, and of the frames of a message. */
+enum { WORDS = (KCG_DATA + 7) / 8 };
+#define WORDS_OF(m) (WORDS == 1 ? 1u : (m)->words)
+#define PAGES_OF(m) (KCG_PAGED ? (m)->pages : 1)
+
+/* --- CRC-32 ----------------------------------------------------------------------------------- */
 
 static uint32_t u32(const uint8_t *p)
 {
@@ -37,8 +52,10 @@ static void crc_init(void)
             crc_table[k][i] = crc_table[k - 1][i] >> 8 ^ crc_table[0][crc_table[k - 1][i] & 255];
 }
 #else
-static const uint32_t nibble[16] = {0x00000000, 0x1db71064, 0x3b6e20c8, 0x26d930ac, 0x76dc4190, 0x6b6b51f4, 0x4db26158, 0x5005713c,
-                                    0xedb88320, 0xf00f9344, 0xd6d6a3e8, 0xcb61b38c, 0x9b64c2b0, 0x86d3d2d4, 0xa00ae278, 0xbdbdf21c};
+static const uint32_t nibble[16] = {
+    0x00000000, 0x1db71064, 0x3b6e20c8, 0x26d930ac, 0x76dc4190, 0x6b6b51f4, 0x4db26158, 0x5005713c,
+    0xedb88320, 0xf00f9344, 0xd6d6a3e8, 0xcb61b38c, 0x9b64c2b0, 0x86d3d2d4, 0xa00ae278, 0xbdbdf21c,
+};
 static void crc_init(void) {}
 #endif
 
@@ -48,32 +65,42 @@ uint32_t kcg_crc32(uint32_t crc, const uint8_t *p, size_t n)
 #if KCG_SLICES == 8
     for (; n >= 8; p += 8, n -= 8) {
         uint32_t a = c ^ u32(p), b = u32(p + 4);
-        c = crc_table[7][a & 255] ^ crc_table[6][a >> 8 & 255] ^ crc_table[5][a >> 16 & 255] ^ crc_table[4][a >> 24] ^
-            crc_table[3][b & 255] ^ crc_table[2][b >> 8 & 255] ^ crc_table[1][b >> 16 & 255] ^ crc_table[0][b >> 24];
+        c = crc_table[7][a & 255] ^ crc_table[6][a >> 8 & 255];
+        c ^= crc_table[5][a >> 16 & 255] ^ crc_table[4][a >> 24];
+        c ^= crc_table[3][b & 255] ^ crc_table[2][b >> 8 & 255];
+        c ^= crc_table[1][b >> 16 & 255] ^ crc_table[0][b >> 24];
     }
 #endif
-    for (; n; p++, n--)
+    for (; n; p++, n--) {
 #if KCG_SLICES
         c = c >> 8 ^ crc_table[0][(c ^ *p) & 255];
 #else
-        c ^= *p, c = c >> 4 ^ nibble[c & 15], c = c >> 4 ^ nibble[c & 15];
+        c ^= *p;
+        c = c >> 4 ^ nibble[c & 15];
+        c = c >> 4 ^ nibble[c & 15];
 #endif
+    }
     return ~c;
 }
 
-/* --- bytes to UART frames (twin: deframer.py) ------------------------------------------------------------------------ */
+/* --- bytes to UART frames (twin: esc/kontronik/deframer.py) ----------------------------------- */
 
-static const struct { uint8_t length, covered; } forms[2][2] = {{{38, 32}, {40, 36}}, {{41, 36}, {44, 40}}}; /* [is info][V4] */
+/* The four forms of frames, by [is info][is V4]. */
+static const struct { uint8_t length, covered; } forms[2][2] = KCG_FRAME_FORMS;
 
+/* Counts the bytes b[from] to b[to - 1] as dropped: under `blame` before `blame_until`, then under
+   `reason`. */
 static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reason)
 {
     if (from >= to)
         return;
     for (size_t i = from; i < to; i++) {
-        uint8_t run = (uint8_t)(0x100 - b[i]); /* 0, FF, FE, FC ... 80: long runs of equal bits */
+        /* 0, FF, FE, FC ... 80: long runs of equal bits, as from a slower line */
+        uint8_t run = (uint8_t)(0x100 - b[i]);
         e->count[KCG_N_LONG_RUN_BYTES] += !(run & (run - 1));
     }
-    uint32_t size = (uint32_t)(to - from), blamed = e->blame_until - (e->base + (uint32_t)from);
+    uint32_t size = (uint32_t)(to - from);
+    uint32_t blamed = e->blame_until - (e->base + (uint32_t)from);
     if ((int32_t)blamed < 0)
         blamed = 0;
     if (blamed > size)
@@ -82,6 +109,8 @@ static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reaso
     e->count[reason] += size - blamed;
 }
 
+/* Drops the four bytes of a header that begins no frame. The rest of `length` bytes is blamed on it
+   as far as it is dropped, too. */
 static void reject(kcg_esc *e, const uint8_t *b, size_t at, size_t length, int reason)
 {
     uint32_t end = e->base + (uint32_t)(at + length);
@@ -93,10 +122,10 @@ static void reject(kcg_esc *e, const uint8_t *b, size_t at, size_t length, int r
 
 static int accept_next(kcg *g);
 
-/* A frame was found; where no further one can be kept, those found are taken first. */
+/* Stores a frame. If there is no room, the stored frames are processed first. */
 static void found(kcg *g, kcg_esc *e, int is_info, int v4, const uint8_t *body, uint32_t end)
 {
-    if (!g) { /* of a flush: too late for use */
+    if (!g) { /* the stream has ended: too late */
         e->count[KCG_N_LATE_FRAMES]++;
         return;
     }
@@ -106,11 +135,14 @@ static void found(kcg *g, kcg_esc *e, int is_info, int v4, const uint8_t *body, 
         g->found_count = g->found_at = 0;
     }
     kcg_found *f = &g->found[g->found_count++];
-    f->end = end, f->is_info = (uint8_t)is_info, f->layout = v4 ? 1 : 2;
-    memcpy(f->body, body, is_info ? KCG_BODY : 30);
+    f->end = end;
+    f->is_info = (uint8_t)is_info;
+    f->layout = v4 ? 1 : 2;
+    memcpy(f->body, body, is_info ? KCG_INFO_SIZE : KCG_LIVE_SIZE);
 }
 
-/* The next K that may begin a header: KO, KOD as far as there are bytes; `size` where there is none. */
+/* Returns the index of the next K that may begin a header, or `size`. The bytes after it are O and
+   D, as far as there are any. */
 static size_t header_at(const uint8_t *b, size_t from, size_t size)
 {
     while (from < size) {
@@ -125,7 +157,16 @@ static size_t header_at(const uint8_t *b, size_t from, size_t size)
     return size;
 }
 
-/* Frames in b[0..size); e->base is the stream position of b[0]. Returns how many bytes are decided; e->need: how many are missing. */
+/* Returns 1 if the CRC of a legacy live frame covers all bytes before it (twin:
+   deframer.has_longer_crc). */
+static int has_longer_crc(const uint8_t *f)
+{
+    size_t covered = forms[0][0].length - 4u;
+    return kcg_crc32(0, f, covered) == u32(f + covered);
+}
+
+/* Finds the frames in b[0] to b[size - 1]. e->base is the position of b[0] in the stream.
+   ended: no further bytes follow. Returns how many bytes are decided, and sets e->need. */
 static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
 {
     size_t at = 0;
@@ -138,8 +179,10 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
         at = start;
         size_t have = size - at;
         if (have < 4) {
-            if (ended && have)
-                drop(e, b, at, size, KCG_N_DROPPED_INCOMPLETE), at = size;
+            if (ended && have) {
+                drop(e, b, at, size, KCG_N_DROPPED_INCOMPLETE);
+                at = size;
+            }
             break;
         }
         const uint8_t *f = b + at;
@@ -149,6 +192,7 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
             at += 3;
             continue;
         }
+        /* Try the shorter form first. The CRC of the longer form continues its CRC. */
         int is_info = f[3] == 'I', v4 = !KCG_LEGACY;
         uint32_t crc = 0;
         size_t missing = 0, covered = 0;
@@ -164,9 +208,9 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
                 break;
         }
         if (v4 == 2) {
-            e->count[KCG_N_HEADERS]++, e->count[KCG_N_CRC_ERRORS]++;
-            if (!is_info && kcg_crc32(0, f, LONGER_COVERED) == u32(f + LONGER_COVERED))
-                e->count[KCG_N_LONGER_CRCS]++;
+            e->count[KCG_N_HEADERS]++;
+            e->count[KCG_N_CRC_ERRORS]++;
+            e->count[KCG_N_LONGER_CRCS] += !is_info && has_longer_crc(f);
             reject(e, b, at, forms[is_info][1].length, KCG_N_DROPPED_CRC);
             at += 4;
         } else if (!missing) {
@@ -189,22 +233,26 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
     return at;
 }
 
+/* Keeps undecided bytes. */
 static void hold(kcg_esc *e, const uint8_t *data, size_t size)
 {
     memmove(e->held, data, size);
     e->held_count = (uint8_t)size;
 }
 
+/* Takes the next bytes of the stream. */
 static void feed(kcg *g, kcg_esc *e, const uint8_t *data, size_t size)
 {
     e->count[KCG_N_BYTES] += size;
     if (!size)
         return;
     if (e->held_count) {
-        size_t old = e->held_count, more = size < KCG_LONGEST ? size : KCG_LONGEST; /* so many decide whatever is held */
+        /* The bytes of one longest frame decide all held bytes. */
+        size_t old = e->held_count, more = size < KCG_LONGEST_FRAME ? size : KCG_LONGEST_FRAME;
         memcpy(e->held + old, data, more);
         if (size < e->need) {
-            e->held_count = (uint8_t)(old + size), e->need = (uint8_t)(e->need - size);
+            e->held_count = (uint8_t)(old + size);
+            e->need = (uint8_t)(e->need - size);
             return;
         }
         size_t at = scan(g, e, e->held, old + more, 0);
@@ -212,14 +260,16 @@ static void feed(kcg *g, kcg_esc *e, const uint8_t *data, size_t size)
             hold(e, e->held + at, old + more - at);
             return;
         }
-        /* what is left begins in `data` again: 43 bytes are held at most */
-        data += at - old, size -= at - old;
+        /* The first undecided byte is in `data`, because at most KCG_MAX_HELD bytes were held. */
+        data += at - old;
+        size -= at - old;
         e->held_count = 0;
     }
     size_t at = scan(g, e, data, size, 0);
     hold(e, data + at, size - at);
 }
 
+/* Ends the stream: decides all held bytes. Without `g`, frames in them are only counted as late. */
 static void flush(kcg *g, kcg_esc *e)
 {
     scan(g, e, e->held, e->held_count, 1);
@@ -229,10 +279,12 @@ static void flush(kcg *g, kcg_esc *e)
     e->arrivals = 0;
 }
 
-/* --- the state of an ESC (twin: telemetry.py) ------------------------------------------------------------------------ */
+/* --- state of an ESC (twins: core/esc_stream.py, esc/telemetry.py) ---------------------------- */
 
-static int64_t wire(const uint8_t *p, int type)
+/* Returns a field of live data or info data. The macros of wire.h call this. */
+static inline int64_t kcg_field(const uint8_t *body, int offset, int type)
 {
+    const uint8_t *p = body + offset;
     switch (type) {
     case KCG_U8: return p[0];
     case KCG_I8: return (int8_t)p[0];
@@ -248,19 +300,27 @@ uint64_t kcg_count(const kcg_esc *e, int what)
     switch (what) {
     case KCG_N_LIVE_FRAMES: return n[KCG_N_LIVE_V4] + n[KCG_N_LIVE_LEGACY];
     case KCG_N_INFO_FRAMES: return n[KCG_N_INFO_V4] + n[KCG_N_INFO_LEGACY];
-    case KCG_N_DROPPED_BYTES: return n[KCG_N_DROPPED_NOISE] + n[KCG_N_DROPPED_CRC] + n[KCG_N_DROPPED_UNKNOWN_KIND] + n[KCG_N_DROPPED_INCOMPLETE];
+    case KCG_N_DROPPED_BYTES:
+        return n[KCG_N_DROPPED_NOISE] + n[KCG_N_DROPPED_CRC] + n[KCG_N_DROPPED_UNKNOWN_KIND] +
+               n[KCG_N_DROPPED_INCOMPLETE];
     case KCG_N_LINK_STATE: return e->link;
     case KCG_N_LAYOUT: return e->layout;
     default: return n[what];
     }
 }
 
-static void note_window(const kcg_esc *e, uint32_t *w)
+/* Counters at the beginning of a second: indices of kcg_esc.window. */
+enum { LIVE_FRAMES, DROPPED_BYTES, BYTES, CRC_ERRORS };
+
+static void note_window(const kcg_esc *e, uint32_t *window)
 {
-    w[0] = (uint32_t)kcg_count(e, KCG_N_LIVE_FRAMES), w[1] = (uint32_t)kcg_count(e, KCG_N_DROPPED_BYTES);
-    w[2] = (uint32_t)e->count[KCG_N_BYTES], w[3] = (uint32_t)e->count[KCG_N_CRC_ERRORS];
+    window[LIVE_FRAMES] = (uint32_t)kcg_count(e, KCG_N_LIVE_FRAMES);
+    window[DROPPED_BYTES] = (uint32_t)kcg_count(e, KCG_N_DROPPED_BYTES);
+    window[BYTES] = (uint32_t)e->count[KCG_N_BYTES];
+    window[CRC_ERRORS] = (uint32_t)e->count[KCG_N_CRC_ERRORS];
 }
 
+/* Functions that return `events` return the events of their changes. */
 static int set_link(kcg_esc *e, int state)
 {
     if (e->link == state)
@@ -276,18 +336,24 @@ static void forget_device(kcg_esc *e)
     e->cells = e->settings.cells;
 }
 
+/* Makes all values of an ESC not available. Its link gets this state. */
 static int lose(kcg_esc *e, int state)
 {
     int events = set_link(e, state);
-    if (e->has_live)
-        e->has_live = 0, e->generation++, events |= KCG_LIVE;
-    if (e->has_info)
-        forget_device(e), events |= KCG_INFO;
+    if (e->has_live) {
+        e->has_live = 0;
+        e->generation++;
+        events |= KCG_LIVE;
+    }
+    if (e->has_info) {
+        forget_device(e);
+        events |= KCG_INFO;
+    }
     e->rate = 0;
     return events;
 }
 
-/* When live data, or info, is too old; KCG_NEVER where there is none. */
+/* Return the time at which live data or info data expire, or KCG_NEVER. */
 static int64_t end_of_live(const kcg_esc *e)
 {
     return e->has_live ? e->live_bound + e->settings.timeout + 1 : KCG_NEVER;
@@ -322,12 +388,17 @@ static int expire_esc(kcg_esc *e, int64_t now)
     return events;
 }
 
+/* Ends a second: computes the rate of live frames and the quality of the link. */
 static int close_window(kcg_esc *e, int64_t now)
 {
     uint32_t new[4], *old = e->window;
     note_window(e, new);
-    int64_t length = now - e->window_ns, frames = new[0] - old[0];
-    int bad = new[3] - old[3] >= e->settings.crc_errors || (uint64_t)(new[1] - old[1]) * 10 > new[2] - old[2];
+    int64_t length = now - e->window_ns;
+    int64_t frames = new[LIVE_FRAMES] - old[LIVE_FRAMES];
+    uint32_t bytes = new[BYTES] - old[BYTES];
+    uint64_t dropped = new[DROPPED_BYTES] - old[DROPPED_BYTES];
+    int has_errors = new[CRC_ERRORS] - old[CRC_ERRORS] >= e->settings.crc_errors;
+    int is_bad = has_errors || dropped * 10 > bytes;
     e->window_ns = now;
     memcpy(old, new, sizeof new);
     e->rate = 0;
@@ -337,23 +408,37 @@ static int close_window(kcg_esc *e, int64_t now)
     if (frames)
         e->interval = length / frames;
     e->rate = (int32_t)((20 * SECOND * frames + length) / (2 * length)); /* halves up */
-    return KCG_SECOND | set_link(e, bad ? KCG_DEGRADED : KCG_OK);
+    return KCG_SECOND | set_link(e, is_bad ? KCG_DEGRADED : KCG_OK);
 }
 
 static int accept_info(kcg_esc *e, const uint8_t *body, int64_t when, int64_t bound)
 {
-    int another = memcmp(body, e->info, 2), events = KCG_INFO;
+    int another = KCG_INFO_DEVICE_AND_VARIANT(body) != KCG_INFO_DEVICE_AND_VARIANT(e->info);
+    int events = KCG_INFO;
     if (!e->has_info || another)
         events |= KCG_NEW_STATE | (e->has_info ? KCG_LINK : 0);
     e->generation++;
-    memcpy(e->info, body, KCG_BODY);
+    memcpy(e->info, body, KCG_INFO_SIZE);
     e->has_info = e->had_info = 1;
-    e->last_info_ns = when, e->info_bound = bound;
-    e->cells = e->settings.cells ? e->settings.cells : body[CELLS_AT];
+    e->last_info_ns = when;
+    e->info_bound = bound;
+    e->cells = e->settings.cells ? e->settings.cells : (uint8_t)KCG_INFO_CELL_COUNT(body);
     return events;
 }
 
-/* A reading of which the last byte came at `when`, at `bound` at the earliest. */
+/* Adds the energy and the run time of `dt` ns, with the power and the speed of the last reading. */
+static void integrate(kcg_esc *e, int64_t dt)
+{
+    if (e->power > 0) { /* at most 2^31 mW, so seconds and the rest are multiplied separately */
+        int64_t rest = e->energy_rest + e->power * (dt % SECOND);
+        e->energy += (uint64_t)(e->power * (dt / SECOND) + rest / SECOND);
+        e->energy_rest = rest % SECOND;
+    }
+    if (e->turns)
+        e->run_time += dt;
+}
+
+/* Takes a frame. Its last byte arrived at `when`, and at `bound` at the earliest. */
 static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
 {
     int events = 0;
@@ -365,31 +450,26 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
     }
     if (f->is_info)
         return events | accept_info(e, f->body, when, bound);
-    e->count[KCG_N_SUSPECT_FRAMES] += f->layout == 2 && f->body[STATE_AT] > LARGEST_STATE;
+    int is_legacy = f->layout == 2;
+    int is_unknown = KCG_LIVE_OPERATING_STATE(f->body) > KCG_LARGEST_STATE;
+    e->count[KCG_N_SUSPECT_FRAMES] += is_legacy && is_unknown;
     if (e->has_time) {
         if (when < e->live_ns)
             when = e->live_ns;
         if (bound < e->live_bound)
             bound = e->live_bound;
-        if (e->has_live) {
-            int64_t dt = when - e->live_ns;
-            if (e->power > 0) { /* 2^31 mW at most: seconds and the rest by themselves */
-                int64_t rest = e->energy_rest + e->power * (dt % SECOND);
-                e->energy += (uint64_t)(e->power * (dt / SECOND) + rest / SECOND);
-                e->energy_rest = rest % SECOND;
-            }
-            if (e->turns)
-                e->run_time += dt;
-        }
+        if (e->has_live)
+            integrate(e, when - e->live_ns);
     }
     e->generation++;
-    if (!e->has_live || memcmp(e->live + ERRORS_AT, f->body + ERRORS_AT, 4))
+    if (!e->has_live || KCG_LIVE_OPERATING_ERRORS(e->live) != KCG_LIVE_OPERATING_ERRORS(f->body))
         events |= KCG_NEW_STATE;
-    memcpy(e->live, f->body, 30);
-    e->power = (int32_t)(wire(f->body + VOLTAGE_AT, KCG_U16) * wire(f->body + CURRENT_AT, KCG_I16));
-    e->turns = u32(f->body) != 0;
+    memcpy(e->live, f->body, KCG_LIVE_SIZE);
+    e->power = (int32_t)(KCG_LIVE_BATTERY_VOLTAGE(f->body) * KCG_LIVE_BATTERY_CURRENT(f->body));
+    e->turns = KCG_LIVE_ELECTRICAL_SPEED(f->body) != 0;
     e->has_live = e->had_live = e->has_time = 1;
-    e->live_ns = when, e->live_bound = bound;
+    e->live_ns = when;
+    e->live_bound = bound;
     if (e->link != KCG_OK && e->link != KCG_DEGRADED) {
         events |= set_link(e, KCG_OK);
         e->rate = -1;
@@ -400,26 +480,29 @@ static int accept(kcg_esc *e, const kcg_found *f, int64_t when, int64_t bound)
     return events | KCG_LIVE;
 }
 
-/* --- values to bits (twin: packer.py, values.py) --------------------------------------------------------------------- */
+/* --- values to bits (twins: signals/packer.py, esc/values.py) --------------------------------- */
 
 static int64_t floor_div(int64_t a, int64_t b)
 {
     return a / b - (a % b < 0);
 }
 
+/* Returns 1 if the ESC supplies a value that the devices in `not_on` do not supply. While the
+   device is unknown, a value of 0 means that it may not supply it. */
 static int supplied(const kcg_esc *e, uint64_t not_on, int64_t x)
 {
-    return (e->has_info || x) && !(e->had_info && not_on >> (e->info[1] >> 2) & 1);
+    int64_t device = KCG_INFO_DEVICE_AND_VARIANT(e->info) >> KCG_VARIANT_BITS;
+    return (e->has_info || x) && !(e->had_info && not_on >> device & 1);
 }
 
-/* A field of live data or info, or a part of it. */
+/* Returns a field of live data or info data, or the part of it that the signal selects. */
 static inline int64_t field(const kcg_signal *s, const uint8_t *body)
 {
-    int64_t x = wire(body + s->place, s->wire);
+    int64_t x = kcg_field(body, s->place, s->wire);
     return s->mask ? x >> s->shift & s->mask : x;
 }
 
-/* Of live data, whatever sends it; 0 where it is not available. */
+/* Reads the value of a KCG_DIRECT signal. Returns 0 if it is not available. */
 static inline int direct(const kcg *g, const kcg_signal *s, int64_t *x)
 {
     const kcg_esc *e = &g->esc[s->esc];
@@ -427,8 +510,9 @@ static inline int direct(const kcg *g, const kcg_signal *s, int64_t *x)
     return e->has_live;
 }
 
-/* The steps of a value before its divisor; 0 where it is not available. */
-static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now, int64_t *x)
+/* Reads the steps of a value before they are divided. Returns 0 if it is not available. */
+static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int64_t now,
+                        int64_t *x)
 {
     switch (s->kind) {
     case KCG_OF_LIVE:
@@ -439,8 +523,8 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
     case KCG_OF_DIRECTED:
         if (!e->has_live)
             return 0;
-        *x = wire(e->live + s->place, s->wire);
-        if (e->live[s->shift] < 32 && s->mask >> e->live[s->shift] & 1)
+        *x = kcg_field(e->live, s->place, s->wire);
+        if (e->live[s->state_place] < 32 && s->negative_states >> e->live[s->state_place] & 1)
             *x = -*x;
         break;
     case KCG_OF_INFO:
@@ -462,28 +546,37 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
         *x = e->rate;
         return e->rate >= 0;
     case KCG_OF_GATEWAY: *x = g->gateway[s->place]; return 1;
-    case KCG_OF_STATUS: *x = e->link | (g->gateway[KCG_GATEWAY_STATE] == s->place) << 6 | e->has_info << 7; return 1;
-    default: *x = floor_div(now - g->gateway[KCG_STARTED_NS], 1000000); return 1; /* a row may be of just before */
+    case KCG_OF_STATUS:
+        *x = e->link | (g->gateway[KCG_GATEWAY_STATE] == s->place) << 6 | e->has_info << 7;
+        return 1;
+    default: /* KCG_OF_UPTIME. A row of a recording can have a time before the start. */
+        *x = floor_div(now - g->gateway[KCG_STARTED_NS], 1000000);
+        return 1;
     }
     return !s->not_on || supplied(e, s->not_on, *x);
 }
 
-static inline int value_of(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
+/* Reads the value x * over / by. Returns 0 if it is not available. */
+static inline int value_of(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by,
+                           int64_t *over)
 {
     const kcg_esc *e = s->esc == 255 ? NULL : &g->esc[s->esc];
     *by = *over = 1;
     if (!steps(g, s, e, now, x))
         return 0;
-    if (s->divisor == KCG_BY_CELLS)
+    if (s->divisor == KCG_BY_CELLS) {
         *by = e->cells;
-    else if (s->divisor == KCG_BY_POLES)
+    } else if (s->divisor == KCG_BY_POLES) {
         *by = e->settings.poles;
-    else if (s->divisor == KCG_BY_OUTPUT)
-        *by = (int64_t)e->settings.poles * e->settings.gear_numerator, *over = e->settings.gear_denominator;
-    return *by != 0; /* the number of cells may not be known */
+    } else if (s->divisor == KCG_BY_OUTPUT) {
+        *by = (int64_t)e->settings.poles * e->settings.gear_numerator;
+        *over = e->settings.gear_denominator;
+    }
+    return *by != 0; /* 0: the number of cells is unknown */
 }
 
-int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over)
+int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by,
+              int64_t *over)
 {
     if (!(s->flags & KCG_DIRECT))
         return value_of(g, s, now, x, by, over);
@@ -492,7 +585,7 @@ int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_
 }
 
 #if KCG_FLOATS
-/* n / d, rounded once; both are less than 2^62. */
+/* Returns n / d, rounded once. Both are less than 2^62. */
 static double quotient(int64_t n, int64_t d)
 {
     const int64_t exact = INT64_C(1) << 53;
@@ -511,20 +604,25 @@ static double quotient(int64_t n, int64_t d)
 }
 
 #if KCG_SLOTS
-/* A float of 16 bits, to the nearest, halves to the even one; |v| <= 65504. */
+/* Returns the nearest 16-bit float, halves to even. |v| <= 65504. */
 static uint64_t half_bits(double v)
 {
-    uint64_t b, sign, rest, middle;
+    uint64_t b;
     memcpy(&b, &v, sizeof b);
-    int exponent = (int)(b >> 52 & 2047) - 1023, drop = exponent < -14 ? 28 - exponent : 42;
-    sign = b >> 48 & 0x8000;
+    uint64_t sign = b >> 48 & 0x8000;
+    int exponent = (int)(b >> 52 & 2047) - 1023;
+    int is_subnormal = exponent < -14;
+    int drop = is_subnormal ? 28 - exponent : 42;
     if (exponent < -25)
         return sign;
     b = (b & ((UINT64_C(1) << 52) - 1)) | UINT64_C(1) << 52;
-    rest = b & ((UINT64_C(1) << drop) - 1), middle = UINT64_C(1) << (drop - 1);
+    uint64_t rest = b & ((UINT64_C(1) << drop) - 1);
+    uint64_t middle = UINT64_C(1) << (drop - 1);
     b >>= drop;
     b += rest > middle || (rest == middle && b & 1);
-    return sign | (b + (exponent < -14 ? 0 : (uint64_t)(exponent + 14) << 10)); /* one bit is that of the exponent */
+    if (!is_subnormal)
+        b += (uint64_t)(exponent + 14) << 10; /* the leading 1 of b adds one to the exponent */
+    return sign | b;
 }
 #endif
 
@@ -541,7 +639,7 @@ static uint64_t float_bits(const kcg_signal *s, double v)
         uint32_t word;
         memcpy(&word, &f, sizeof word);
         if ((word & 0x7F800000u) == 0x7F800000u && v - v == 0.0)
-            return s->error; /* finite, but too large for 32 bits */
+            return s->error; /* v is finite, but too large for 32 bits */
         bits = word;
 #if KCG_SLOTS
     } else if (s->length == 16) {
@@ -554,6 +652,7 @@ static uint64_t float_bits(const kcg_signal *s, double v)
 }
 #endif
 
+/* Returns the raw value of a signal. */
 static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive)
 {
     int64_t x, v, by, over;
@@ -581,23 +680,26 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
         return float_bits(s, s->flags & KCG_PLAIN ? q : q + offset);
     }
 #endif
-    if (s->flags & KCG_PLAIN)
+    if (s->flags & KCG_PLAIN) {
         v = x;
-    else if (x > s->most || x < -s->most) {
+    } else if (x > s->most || x < -s->most) {
         int is_below = (x < 0) == (s->mul > 0);
         return s->flags & KCG_SATURATES && is_below ? (uint64_t)s->low : s->error;
-    } else
+    } else {
         v = floor_div(x * s->mul * over + s->add * by, s->div * by);
+    }
     if (s->flags & KCG_ROLLS)
         return (uint64_t)v % ((uint64_t)s->high + 1);
     if (s->flags & KCG_SATURATES && v < s->low)
-        return (uint64_t)s->low; /* above `high` the code for Error is `high` */
+        return (uint64_t)s->low; /* above `high`, `error` is `high` */
     if (v > s->high || v < s->low || (s->flags & KCG_CODE_AMID && (uint64_t)v == s->not_available))
         return s->error;
     return (uint64_t)v;
 }
 
-static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int alive, uint64_t *bits)
+/* Packs a page of a message: its constant bits, then its signals. */
+static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int alive,
+                 uint64_t *bits)
 {
     const kcg_plan *plan = g->plan;
     const kcg_signal *s = plan->signal + m->first_signal, *end = s + m->signals;
@@ -616,13 +718,14 @@ static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int
         else
             raw = s->not_available;
         const kcg_piece *p = plan->piece + s->first_piece, *last = p + s->pieces;
-        do
-            bits[WORDS == 1 ? 0 : p->at / 64] |= (raw >> p->shift & (~UINT64_C(0) >> (64 - p->width))) << p->at % 64;
-        while (++p < last);
+        do {
+            uint64_t part = raw >> p->shift & (~UINT64_C(0) >> (64 - p->width));
+            bits[WORDS == 1 ? 0 : p->at / 64] |= part << p->at % 64;
+        } while (++p < last);
     }
 }
 
-/* --- when (twin: core/messages.py) ---------------------------------------------------------------------------------------- */
+/* --- deadlines (twin: core/messages.py) ------------------------------------------------------- */
 
 static int64_t due_of(const kcg *g, uint32_t i)
 {
@@ -635,7 +738,7 @@ static void put_in_heap(kcg *g, uint32_t place, uint32_t i)
     g->sending[i].place_in_heap = (uint16_t)place;
 }
 
-/* Restore the order of the heap after a change of one message's deadline. */
+/* Restores the order of the heap after a message's deadline has changed. */
 static void moved(kcg *g, uint32_t i)
 {
     uint32_t at = g->sending[i].place_in_heap;
@@ -658,6 +761,7 @@ static void moved(kcg *g, uint32_t i)
     put_in_heap(g, at, i);
 }
 
+/* Requests a message again at a later time. */
 static void defer(kcg *g, uint32_t i, int64_t until)
 {
     if (g->sending[i].deferred == KCG_NEVER) {
@@ -666,14 +770,15 @@ static void defer(kcg *g, uint32_t i, int64_t until)
     }
 }
 
+/* Returns 1 if the minimum distance to the last frame has passed. */
 static int may_go(const kcg *g, uint32_t i, int64_t now)
 {
     return now >= g->sending[i].last + g->plan->message[i].delay;
 }
 
-/* --- messages (twin: messages.py) ------------------------------------------------------------------------------------ */
+/* --- messages (twin: core/messages.py) -------------------------------------------------------- */
 
-/* Let a page follow without waiting for an event. */
+/* Lets a page be sent without a further event. */
 static void let_follow(kcg *g, uint32_t i, int place)
 {
     uint8_t *page = &g->page[g->plan->message[i].first_page + place];
@@ -681,7 +786,7 @@ static void let_follow(kcg *g, uint32_t i, int place)
     *page |= TO_SEND;
 }
 
-/* Let all pages follow, of a message that has several. */
+/* Lets all pages of a message with several pages be sent without a further event. */
 static void let_all_follow(kcg *g, uint32_t i)
 {
     int pages = PAGES_OF(&g->plan->message[i]);
@@ -694,6 +799,7 @@ static int page_after(const kcg_message *m, int place)
     return place + 1 < m->pages ? place + 1 : 0;
 }
 
+/* Lets the next page be sent, and turns to the page after it. */
 static void turn_page(kcg *g, uint32_t i)
 {
     kcg_sending *s = &g->sending[i];
@@ -701,7 +807,7 @@ static void turn_page(kcg *g, uint32_t i)
     s->page = (uint8_t)page_after(&g->plan->message[i], s->page);
 }
 
-/* Of several pages the first that is to follow, from the one on whose turn it is next. */
+/* Returns the page to be sent next: the first one to be sent, beginning at the next page. */
 static int next_of_pages(kcg *g, uint32_t i)
 {
     const kcg_message *m = &g->plan->message[i];
@@ -718,6 +824,7 @@ static inline int next_place(kcg *g, uint32_t i)
     return PAGES_OF(&g->plan->message[i]) > 1 ? next_of_pages(g, i) : 0;
 }
 
+/* Makes a message pending. `why` is added to its reasons. */
 static void mark(kcg *g, uint32_t i, int64_t since, int why)
 {
     kcg_sending *s = &g->sending[i];
@@ -730,16 +837,17 @@ static void mark(kcg *g, uint32_t i, int64_t since, int why)
     s->why = (uint8_t)(s->why | why);
 }
 
-/* Of a message that is sent on change: whether it has changed; of several pages those that have follow. */
+/* Returns 1 if a message that is sent on change has changed. Marks its changed pages to be sent. */
 static int has_changed(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
     uint64_t bits[WORDS];
     int changed = 0;
     for (int place = 0; place < PAGES_OF(m); place++) {
+        const uint64_t *last = g->last + m->first_word + (size_t)place * WORDS_OF(m);
         pack(g, m, place, now, 0, bits);
         if (!(g->page[m->first_page + place] & KNOWN) ||
-            memcmp(bits, g->last + m->first_word + (size_t)place * WORDS_OF(m), WORDS_OF(m) * sizeof *bits)) {
+            memcmp(bits, last, WORDS_OF(m) * sizeof *bits)) {
             changed = 1;
             if (PAGES_OF(m) > 1)
                 let_follow(g, i, place);
@@ -750,10 +858,12 @@ static int has_changed(kcg *g, uint32_t i, int64_t now)
 
 static inline int is_news(kcg *g, uint32_t i, int64_t now)
 {
-    return (g->plan->message[i].flags & (KCG_EVENT | KCG_ON_CHANGE)) != KCG_ON_CHANGE || has_changed(g, i, now);
+    int is_only_on_change =
+        (g->plan->message[i].flags & (KCG_EVENT | KCG_ON_CHANGE)) == KCG_ON_CHANGE;
+    return !is_only_on_change || has_changed(g, i, now);
 }
 
-/* Let a message be handed over as soon as its minimum distance allows. */
+/* Requests a message: at once, or as soon as its minimum distance allows. */
 static void request(kcg *g, uint32_t i, int64_t now)
 {
     if (may_go(g, i, now)) {
@@ -764,7 +874,7 @@ static void request(kcg *g, uint32_t i, int64_t now)
     }
 }
 
-/* --- slots (twin: core/slots.py) ------------------------------------------------------------------------------------------ */
+/* --- slots (twin: core/slots.py) -------------------------------------------------------------- */
 
 static int is_slot(const kcg *g, uint32_t i)
 {
@@ -774,16 +884,29 @@ static int is_slot(const kcg *g, uint32_t i)
 static void restart_timer(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
-    g->sending[i].cycle_due = m->flags & KCG_EVENT && m->cycle ? now + m->cycle : KCG_NEVER;
+    int has_timer = m->flags & KCG_EVENT && m->cycle;
+    g->sending[i].cycle_due = has_timer ? now + m->cycle : KCG_NEVER;
     moved(g, i);
 }
 
+static kcg_slot *slot_of(const kcg *g, uint32_t i)
+{
+    return &g->slot[i - g->plan->messages];
+}
+
+static const kcg_slot_row *slot_row_of(const kcg *g, uint32_t i)
+{
+    return &g->plan->slot_row[i - g->plan->messages];
+}
+
+/* Requests a started slot whose content has changed. */
 static void slot_news(kcg *g, uint32_t i, int64_t now)
 {
     kcg_sending *s = &g->sending[i];
-    if (!(s->page & STARTED))
+    kcg_slot *slot = slot_of(g, i);
+    if (!(slot->state & STARTED))
         return;
-    s->page |= NEWS;
+    slot->state |= NEWS;
     if (!(g->plan->message[i].flags & KCG_EVENT) || s->why)
         return;
     if (!may_go(g, i, now)) {
@@ -791,18 +914,22 @@ static void slot_news(kcg *g, uint32_t i, int64_t now)
             defer(g, i, s->last + g->plan->message[i].delay);
         return;
     }
-    if (s->deferred != KCG_NEVER)
-        s->deferred = KCG_NEVER, moved(g, i);
+    if (s->deferred != KCG_NEVER) {
+        s->deferred = KCG_NEVER;
+        moved(g, i);
+    }
     mark(g, i, now, REQUEST);
 }
 
+/* Returns 1 if watched bits have changed since the last call. */
 static int watched_changed(kcg *g, uint32_t i, const uint64_t *bits)
 {
-    uint64_t *last = g->last + g->plan->message[i].first_word, now = *bits & g->plan->watched[i - g->plan->messages];
-    if (g->sending[i].page & SEEN && now == *last)
+    kcg_slot *slot = slot_of(g, i);
+    uint64_t watched = *bits & slot_row_of(g, i)->watched;
+    if (slot->state & SEEN && watched == slot->seen_bits)
         return 0;
-    g->sending[i].page |= SEEN;
-    *last = now;
+    slot->state |= SEEN;
+    slot->seen_bits = watched;
     return 1;
 }
 
@@ -811,9 +938,9 @@ static void slot_event(kcg *g, uint32_t i, int events, int64_t now)
     const kcg_message *m = &g->plan->message[i];
     const kcg_sending *s = &g->sending[i];
     uint64_t bits[WORDS];
-    if (!(s->page & STARTED && m->triggers & events) || s->why)
+    if (!(slot_of(g, i)->state & STARTED && m->triggers & events) || s->why)
         return;
-    if (s->deferred == KCG_NEVER && g->plan->watched[i - g->plan->messages]) {
+    if (s->deferred == KCG_NEVER && slot_row_of(g, i)->watched) {
         pack(g, m, 0, now, 0, bits);
         if (!watched_changed(g, i, bits))
             return;
@@ -821,7 +948,7 @@ static void slot_event(kcg *g, uint32_t i, int events, int64_t now)
     slot_news(g, i, now);
 }
 
-/* Its timer, or what the inhibit time held back, is due. */
+/* Handles the timer of a slot, and a request that waited for the inhibit time. */
 static void slot_due(kcg *g, uint32_t i, int64_t now)
 {
     kcg_sending *s = &g->sending[i];
@@ -836,28 +963,35 @@ static void slot_sent(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
     kcg_sending *s = &g->sending[i];
-    int64_t period = (m->delay + m->cycle) / 2, planned = s->last + period;
-    g->last[m->first_word + 1]++;
-    s->page &= STARTED | SEEN;
+    kcg_slot *slot = slot_of(g, i);
+    /* A paced slot keeps its rate on average: its frame counts as sent at the planned time. */
+    int64_t period = (m->delay + m->cycle) / 2;
+    int64_t planned = s->last + period;
+    int is_on_time = planned - period < now && now < planned + period;
+    slot->frames_sent++;
+    slot->state &= STARTED | SEEN;
     s->why = 0;
-    s->last = m->flags & KCG_PACED && planned - period < now && now < planned + period ? planned : now;
+    s->last = m->flags & KCG_PACED && is_on_time ? planned : now;
     s->deferred = KCG_NEVER;
     restart_timer(g, i, s->last);
 }
 
-/* Whether a paced slot rests; then it goes with the first event after that. */
+/* Returns 1 if a paced slot rests, because its first value is not available. The first event after
+   that sends it. */
 static int slot_rests(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
+    const kcg_signal *first = g->plan->signal + m->first_signal;
     int64_t x, by, over;
-    if (!(m->flags & KCG_PACED) || value_of(g, g->plan->signal + m->first_signal, now, &x, &by, &over))
+    if (!(m->flags & KCG_PACED) || value_of(g, first, now, &x, &by, &over))
         return 0;
-    g->sending[i].last = LONG_AGO, g->sending[i].cycle_due = KCG_NEVER;
+    g->sending[i].last = LONG_AGO;
+    g->sending[i].cycle_due = KCG_NEVER;
     moved(g, i);
     return 1;
 }
 
-/* The frames of a message. */
+/* Returns the number of frames of a message. Twin: native/slots.py, _count_frames. */
 static uint32_t parts_of(const kcg_message *m)
 {
     return KCG_SLOTS && m->flags & KCG_TRANSFER && m->length > 7 ? (m->length + 8u) / 7 : 1;
@@ -868,7 +1002,7 @@ void kcg_slot_start(kcg *g, uint32_t slot, int64_t now)
 {
     uint32_t i = g->plan->messages + slot;
     kcg_slot_stop(g, slot);
-    g->sending[i].page = STARTED;
+    g->slot[slot].state = STARTED;
     g->sending[i].last = LONG_AGO;
     restart_timer(g, i, now);
     slot_news(g, i, now);
@@ -886,7 +1020,7 @@ void kcg_slot_stop(kcg *g, uint32_t slot)
 {
     uint32_t i = g->plan->messages + slot, at = 0;
     kcg_sending *s = &g->sending[i];
-    s->page = 0;
+    g->slot[slot].state = 0;
     s->cycle_due = s->deferred = KCG_NEVER;
     moved(g, i);
     if (!s->why)
@@ -905,13 +1039,13 @@ void kcg_slot_news(kcg *g, uint32_t slot, int64_t now)
 void kcg_slot_send(kcg *g, uint32_t slot, int64_t now)
 {
     uint32_t i = g->plan->messages + slot;
-    if (g->sending[i].page & STARTED && !g->sending[i].why)
+    if (g->slot[slot].state & STARTED && !g->sending[i].why)
         mark(g, i, now, REQUEST);
 }
 
 int kcg_slot_is_news(const kcg *g, uint32_t slot)
 {
-    return (g->sending[g->plan->messages + slot].page & NEWS) != 0;
+    return (g->slot[slot].state & NEWS) != 0;
 }
 
 int kcg_slot_is_pending(const kcg *g, uint32_t slot)
@@ -921,10 +1055,11 @@ int kcg_slot_is_pending(const kcg *g, uint32_t slot)
 
 uint64_t kcg_slot_sent(const kcg *g, uint32_t slot)
 {
-    return g->last[g->plan->message[g->plan->messages + slot].first_word + 1];
+    return g->slot[slot].frames_sent;
 }
 
-static uint32_t crc_16(uint32_t crc, const uint8_t *data, size_t size) /* CCITT */
+/* CRC-16-CCITT. */
+static uint32_t crc_16(uint32_t crc, const uint8_t *data, size_t size)
 {
     for (; size; data++, size--) {
         crc ^= (uint32_t)*data << 8;
@@ -934,38 +1069,48 @@ static uint32_t crc_16(uint32_t crc, const uint8_t *data, size_t size) /* CCITT 
     return crc & 0xFFFF;
 }
 
-/* The frames of a transfer (twin: signals/transfer.py), of which the first holds the bare payload. */
-static void make_transfer(kcg *g, const kcg_message *m, kcg_frame *f)
+/* Makes the frames of a transfer (twin: signals/transfer.py). f[0] contains the bare payload. */
+static void make_transfer(kcg *g, uint32_t i, kcg_frame *f)
 {
+    const kcg_message *m = &g->plan->message[i];
+    const kcg_slot_row *row = slot_row_of(g, i);
     uint8_t data[2 + WORDS * 8], *rest = data + 2;
-    uint32_t parts = parts_of(m), size = m->length, first = g->plan->messages;
+    uint32_t parts = parts_of(m), size = m->length;
+    uint32_t first = g->plan->messages; /* the first slot with this id has the number */
     while (g->plan->message[first].id != m->id)
         first++;
-    uint32_t number = g->sending[first].alive++ & 31u;
+    uint32_t number = slot_of(g, first)->transfer_number++ & 31u;
     memcpy(rest, f->data, size);
     if (parts > 1) {
-        uint32_t crc = crc_16(m->data_id, rest, size);
-        data[0] = (uint8_t)crc, data[1] = (uint8_t)(crc >> 8);
-        rest = data, size += 2;
+        uint32_t crc = crc_16(row->crc_seed, rest, size);
+        data[0] = (uint8_t)crc;
+        data[1] = (uint8_t)(crc >> 8);
+        rest = data;
+        size += 2;
     }
     for (uint32_t k = 0; k < parts; k++, f++) {
         uint32_t length = size < 7 ? size : 7;
+        uint32_t start = k == 0, end = k + 1 == parts, toggle = k & 1;
         memset(f, 0, sizeof *f);
-        f->id = m->id, f->length = (uint8_t)(length + 1), f->page = (uint8_t)(m->crc_at + k);
+        f->id = m->id;
+        f->length = (uint8_t)(length + 1);
+        f->page = (uint8_t)(row->page + k);
         memcpy(f->data, rest, length);
-        f->data[length] = (uint8_t)(number | (k ? 0 : 0x80) | (k + 1 < parts ? 0 : 0x40) | (k & 1 ? 0x20 : 0));
-        rest += length, size -= length;
+        f->data[length] = (uint8_t)(start << 7 | end << 6 | toggle << 5 | number);
+        rest += length;
+        size -= length;
     }
 }
 #endif
 
-/* --- what makes messages pending, their frames ----------------------------------------------------------------------- */
+/* --- requests and frames (twin: core/messages.py) --------------------------------------------- */
 
+/* Requests the messages that follow these events of an ESC. */
 static void on_event(kcg *g, int esc, int events, int64_t now)
 {
     const kcg_plan *plan = g->plan;
     const kcg_esc *e = &g->esc[esc];
-    int gone = !e->has_live || (events & KCG_INFO && !e->has_info);
+    int is_lost = !e->has_live || (events & KCG_INFO && !e->has_info);
     for (int k = plan->first_listener[esc]; k < plan->first_listener[esc + 1]; k++) {
         uint32_t i = plan->listener[k];
         const kcg_message *m = &plan->message[i];
@@ -975,10 +1120,10 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
         }
         int hit = m->triggers & events;
         if (e->has_live && m->flags & KCG_EVENT && m->triggers & KCG_LIVE)
-            hit &= ~KCG_LINK; /* live frames set the pace */
+            hit &= ~KCG_LINK; /* live frames determine when it is sent */
         if (!hit)
             continue;
-        if (gone && m->flags & KCG_EVENT)
+        if (is_lost && m->flags & KCG_EVENT)
             let_all_follow(g, i);
         if (g->sending[i].why)
             continue;
@@ -1024,6 +1169,7 @@ void kcg_stop(kcg *g, int64_t now)
     }
 }
 
+/* Handles cycles and minimum distances that are due. */
 static void advance_messages(kcg *g, int64_t now)
 {
     while (g->heaped) {
@@ -1055,6 +1201,7 @@ static void advance_messages(kcg *g, int64_t now)
     }
 }
 
+/* Returns 1 if a message is not sent because all of its ESCs are without live data. */
 static int is_silent(const kcg *g, const kcg_message *m)
 {
     if (!(m->flags & KCG_SILENT))
@@ -1065,32 +1212,47 @@ static int is_silent(const kcg *g, const kcg_message *m)
     return 1;
 }
 
-static uint8_t e2e_crc(const kcg_frame *f, int at, int data_id) /* AUTOSAR E2E profile 1: CRC-8 SAE J1850, 0 at both ends */
+/* CRC-8 SAE J1850 without its inversions, as AUTOSAR E2E profile 1 uses it. */
+static uint8_t crc_8(uint8_t c, int byte)
 {
-    uint8_t c = 0;
-    for (int i = -2; i < f->length; i++) {
-        if (i == at)
-            continue;
-        c ^= (uint8_t)(i == -2 ? data_id : i == -1 ? data_id >> 8 : f->data[i]);
-        for (int k = 0; k < 8; k++)
-            c = (uint8_t)(c & 0x80 ? c << 1 ^ 0x1D : c << 1);
-    }
+    c ^= (uint8_t)byte;
+    for (int k = 0; k < 8; k++)
+        c = (uint8_t)(c & 0x80 ? c << 1 ^ 0x1D : c << 1);
     return c;
 }
 
-static void put_u64(uint8_t *p, uint64_t v)
+/* Returns the CRC of AUTOSAR E2E profile 1: the data id, then the frame without byte `at` (twin:
+   signals/packer.py). */
+static uint8_t e2e_crc(const kcg_frame *f, int at, int data_id)
 {
-    p[0] = (uint8_t)v, p[1] = (uint8_t)(v >> 8), p[2] = (uint8_t)(v >> 16), p[3] = (uint8_t)(v >> 24);
-    p[4] = (uint8_t)(v >> 32), p[5] = (uint8_t)(v >> 40), p[6] = (uint8_t)(v >> 48), p[7] = (uint8_t)(v >> 56);
+    uint8_t c = crc_8(crc_8(0, data_id), data_id >> 8);
+    for (int i = 0; i < f->length; i++)
+        if (i != at)
+            c = crc_8(c, f->data[i]);
+    return c;
 }
 
+/* Little-endian. Not a loop, because GCC makes one store of it. */
+static void put_u64(uint8_t *p, uint64_t v)
+{
+    p[0] = (uint8_t)v;
+    p[1] = (uint8_t)(v >> 8);
+    p[2] = (uint8_t)(v >> 16);
+    p[3] = (uint8_t)(v >> 24);
+    p[4] = (uint8_t)(v >> 32);
+    p[5] = (uint8_t)(v >> 40);
+    p[6] = (uint8_t)(v >> 48);
+    p[7] = (uint8_t)(v >> 56);
+}
+
+/* Packs the next frame of a message, or all frames of a transfer. */
 static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
 {
     const kcg_message *m = &g->plan->message[i];
     kcg_sending *s = &g->sending[i];
     uint64_t bits[WORDS];
     if (s->why & CYCLE && PAGES_OF(m) > 1) {
-        s->why = REQUEST | TURNED; /* once, however often it is taken before it is sent */
+        s->why = REQUEST | TURNED; /* once, even if it is taken several times before it is sent */
         turn_page(g, i);
     }
     int place = next_place(g, i);
@@ -1098,28 +1260,33 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     if (is_slot(g, i))
         watched_changed(g, i, bits);
     memset(f, 0, sizeof *f);
-    f->page = is_slot(g, i) ? m->crc_at : (uint8_t)place;
-    f->id = m->id, f->length = m->length, f->flags = m->fd_flags;
-    for (int k = 0; k < (int)WORDS_OF(m); k++) /* beyond the length they are 0 */
+    f->page = is_slot(g, i) ? slot_row_of(g, i)->page : (uint8_t)place;
+    f->id = m->id;
+    f->length = m->length;
+    f->flags = m->fd_flags;
+    for (int k = 0; k < (int)WORDS_OF(m); k++) /* bytes beyond the length are 0 */
         put_u64(f->data + k * 8, bits[k]);
     if (KCG_E2E && m->flags & KCG_HAS_CRC)
         f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
 #if KCG_SLOTS
     if (m->flags & KCG_TRANSFER)
-        make_transfer(g, m, f);
+        make_transfer(g, i, f);
 #endif
 }
 
-static int goes_before(const kcg *g, uint32_t i, uint32_t other)
+/* Returns 1 if i is sent before the other. Slots are first, then the longest pending, then the
+   lower index. */
+static int is_before(const kcg *g, uint32_t i, uint32_t other)
 {
-    int64_t since = g->sending[i].since, its = g->sending[other].since;
+    int64_t since = g->sending[i].since;
+    int64_t other_since = g->sending[other].since;
     if (is_slot(g, i) != is_slot(g, other))
         return is_slot(g, i);
-    return since == its ? i < other : since < its;
+    return since == other_since ? i < other : since < other_since;
 }
 
-/* Sort: slots first, each by the time since when it is pending, then by index. A Shell sort, because they can be in any order; gaps of
-   2^k - 1 bound it to size^1.5 steps (A. Papernov and G. Stasevich, 1965). */
+/* Sorts the pending messages and slots. They can be in any order, so this is a Shell sort. Gaps of
+   2^k - 1 limit it to size^1.5 steps (A. Papernov and G. Stasevich, 1965). */
 static void sort_pending(kcg *g)
 {
     uint32_t size = g->pendings, gap = 1;
@@ -1129,7 +1296,7 @@ static void sort_pending(kcg *g)
         for (uint32_t k = gap; k < size; k++) {
             uint32_t i = g->pending[k];
             uint32_t at = k;
-            while (at >= gap && goes_before(g, i, g->pending[at - gap])) {
+            while (at >= gap && is_before(g, i, g->pending[at - gap])) {
                 g->pending[at] = g->pending[at - gap];
                 at -= gap;
                 g->pending[at] = (uint16_t)i;
@@ -1137,7 +1304,7 @@ static void sort_pending(kcg *g)
         }
 }
 
-/* Of the first `done` that were pending the first `kept` places stay. */
+/* Removes all but the first `kept` of the first `done` entries of `pending`. */
 static void keep_pending(kcg *g, uint32_t kept, uint32_t done)
 {
     memmove(g->pending + kept, g->pending + done, (g->pendings - done) * sizeof *g->pending);
@@ -1172,7 +1339,7 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
         g->taken += parts_of(m);
         g->pending[kept++] = (uint16_t)i;
         if (KCG_PAGED && g->stopping && s->pages_to_send > 1) {
-            k++; /* its other pages go next */
+            k++; /* its other pages are next */
             break;
         }
     }
@@ -1207,22 +1374,27 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
         if (!(m->flags & KCG_FREE)) {
             s->last = now;
             s->cycle_deferred = 0;
-            if (s->deferred != KCG_NEVER)
-                s->deferred = KCG_NEVER, moved(g, i);
+            if (s->deferred != KCG_NEVER) {
+                s->deferred = KCG_NEVER;
+                moved(g, i);
+            }
             if (!KCG_PAGED || !s->pages_to_send)
                 continue;
-            if (g->stopping)
-                s->why = REQUEST, g->pending[kept++] = (uint16_t)i;
-            else
-                defer(g, i, now + (m->delay > MIN_DISTANCE ? m->delay : MIN_DISTANCE));
+            if (g->stopping) {
+                s->why = REQUEST;
+                g->pending[kept++] = (uint16_t)i;
+                continue;
+            }
+            defer(g, i, now + (m->delay > MIN_DISTANCE ? m->delay : MIN_DISTANCE));
         }
     }
     keep_pending(g, kept, k);
     g->taken = 0;
 }
 
-/* --- together (twin: core/python_core.py) ---------------------------------------------------------------------------------------- */
+/* --- the core (twin: core/python_core.py) ----------------------------------------------------- */
 
+/* Handles events of an ESC: requests messages, and stores the events that the owner follows. */
 static void report(kcg *g, int esc, int events, int64_t now)
 {
     if (!events)
@@ -1253,13 +1425,14 @@ static int64_t first_expiry(const kcg *g)
     return first;
 }
 
-static void expire(kcg *g, int64_t now, int but)
+/* Drops values that are too old, and ends seconds. ESC `except` is left out; -1: none is. */
+static void expire(kcg *g, int64_t now, int except)
 {
     if (now < g->next_expiry)
         return;
     for (int i = 0; i < g->plan->escs; i++) {
         kcg_esc *e = &g->esc[i];
-        if (i != but && now >= esc_deadline(e)) {
+        if (i != except && now >= esc_deadline(e)) {
             int events = expire_esc(e, now);
             if (now - e->window_ns >= SECOND)
                 events |= close_window(e, now);
@@ -1273,18 +1446,22 @@ static void expire(kcg *g, int64_t now, int but)
     }
 }
 
-/* Take the next frame of the read; 0 where there is none. */
+/* Processes the next stored frame. Returns 0 if there is none. */
 static int accept_next(kcg *g)
 {
     if (g->found_at >= g->found_count)
         return 0;
     const kcg_found *f = &g->found[g->found_at++];
     kcg_esc *e = &g->esc[g->read_esc];
-    int64_t after = (g->read_end - f->end) * KCG_BYTE_NS, limit = f->is_info ? INFO_TIMEOUT : e->settings.timeout;
-    if (g->read_now - g->read_bound + after > limit) /* the bytes after it in the same read make it old already */
+    int64_t after = (g->read_end - f->end) * KCG_BYTE_NS; /* time of the later bytes of the read */
+    int64_t limit = f->is_info ? INFO_TIMEOUT : e->settings.timeout;
+    int64_t bound = g->read_bound - after;
+    if (g->read_now - bound > limit) {
         e->count[KCG_N_LATE_FRAMES]++;
-    else
-        report(g, g->read_esc, accept(e, f, g->read_shown - after, g->read_bound - after), g->read_now);
+        return 1;
+    }
+    int events = accept(e, f, g->read_shown - after, bound);
+    report(g, g->read_esc, events, g->read_now);
     return 1;
 }
 
@@ -1308,17 +1485,21 @@ int kcg_next_event(kcg *g)
     }
 }
 
+/* Notes when the held bytes up to the position `end` arrived. Forgets reads without held bytes. */
 static void note_arrival(kcg_esc *e, uint32_t end, int64_t bound)
 {
-    int gone = 0, left;
+    int decided = 0;
     uint32_t begin = end - e->held_count;
-    while (gone < e->arrivals && (int32_t)(e->arrival_end[gone] - begin) <= 0)
-        gone++;
-    left = e->arrivals - gone;
-    memmove(e->arrival_end, e->arrival_end + gone, (size_t)left * sizeof *e->arrival_end);
-    memmove(e->arrival_bound, e->arrival_bound + gone, (size_t)left * sizeof *e->arrival_bound);
-    if (e->held_count)
-        e->arrival_end[left] = end, e->arrival_bound[left++] = bound;
+    while (decided < e->arrivals && (int32_t)(e->arrival_end[decided] - begin) <= 0)
+        decided++;
+    int left = e->arrivals - decided;
+    memmove(e->arrival_end, e->arrival_end + decided, (size_t)left * sizeof *e->arrival_end);
+    memmove(e->arrival_bound, e->arrival_bound + decided, (size_t)left * sizeof *e->arrival_bound);
+    if (e->held_count) {
+        e->arrival_end[left] = end;
+        e->arrival_bound[left] = bound;
+        left++;
+    }
     e->arrivals = (uint8_t)left;
 }
 
@@ -1326,7 +1507,7 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
 {
     kcg_esc *e = &g->esc[esc];
     if (!g->again) {
-        expire(g, now, esc); /* a message may hold values of several ESCs */
+        expire(g, now, esc); /* a message can contain values of several ESCs */
         report(g, esc, expire_esc(e, now), now);
         g->again = g->reports > 0;
         if (g->again)
@@ -1335,7 +1516,8 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
     g->again = 0;
     if (e->arrivals && now - e->arrival_bound[0] > e->settings.timeout)
         flush(NULL, e);
-    int64_t bound = earlier(now, since + ((int64_t)size - 1) * KCG_BYTE_NS); /* a pseudo terminal is faster than the wire */
+    /* The last byte arrived after the others. A pseudo terminal is faster than the wire. */
+    int64_t bound = earlier(now, since + ((int64_t)size - 1) * KCG_BYTE_NS);
     g->read_esc = esc;
     g->read_now = now;
     g->read_bound = bound;
@@ -1373,7 +1555,7 @@ int kcg_port(kcg *g, int esc, int is_open, int64_t now)
     if (!is_open) {
         uint64_t late = e->count[KCG_N_LATE_FRAMES];
         flush(NULL, e);
-        e->count[KCG_N_LATE_FRAMES] = late; /* that it was dropped is said by the link */
+        e->count[KCG_N_LATE_FRAMES] = late; /* the state of the link reports the loss already */
         report(g, esc, lose(e, KCG_PORT_ERROR), now);
     } else if (e->link == KCG_PORT_ERROR) {
         report(g, esc, set_link(e, e->has_time ? KCG_LOST : KCG_NEVER_SEEN), now);
@@ -1391,13 +1573,15 @@ void kcg_apply(kcg *g, int esc, const kcg_settings *settings)
 {
     kcg_esc *e = &g->esc[esc];
     e->settings = *settings;
-    e->cells = settings->cells ? settings->cells : e->has_info ? e->info[CELLS_AT] : 0;
+    e->cells = settings->cells;
+    if (!e->cells && e->has_info)
+        e->cells = (uint8_t)KCG_INFO_CELL_COUNT(e->info);
     g->next_expiry = 0;
 }
 
 size_t kcg_size(const kcg_plan *p)
 {
-    return KCG_SIZE(p->messages + p->slots, p->escs, p->pages, p->words);
+    return KCG_SIZE(p->messages, p->slots, p->escs, p->pages, p->words);
 }
 
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now)
@@ -1408,7 +1592,8 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
     crc_init();
     g->esc = (kcg_esc *)(g + 1);
     g->sending = (kcg_sending *)(g->esc + plan->escs);
-    g->last = (uint64_t *)(g->sending + messages);
+    g->slot = (kcg_slot *)(g->sending + messages);
+    g->last = (uint64_t *)(g->slot + plan->slots);
     g->heap = (uint16_t *)(g->last + plan->words);
     g->pending = g->heap + messages;
     g->page = (uint8_t *)(g->pending + messages);
@@ -1435,17 +1620,20 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
     return g;
 }
 
-/* --- for a caller that cannot see structures ------------------------------------------------------------------------- */
+/* --- for callers that cannot include core.h --------------------------------------------------- */
 
 #if KCG_SOURCE
 uint32_t kcg_sizes(uint32_t what)
 {
-    static const size_t size[] = {KCG_SOURCE, sizeof(kcg_signal), sizeof(kcg_message), sizeof(kcg_settings), sizeof(kcg_plan), sizeof(kcg_esc), sizeof(kcg_frame)};
+    static const size_t size[] = {
+        KCG_SOURCE,
+        sizeof(kcg_signal),
+        sizeof(kcg_message),
+        sizeof(kcg_settings),
+        sizeof(kcg_plan),
+        sizeof(kcg_esc),
+        sizeof(kcg_frame),
+    };
     return what < sizeof size / sizeof *size ? (uint32_t)size[what] : 0;
-}
-
-const char *kcg_wire(void)
-{
-    return "IHhhhHHHHbBbbIBB HHIBIHHhhhHHbBbbbb";
 }
 #endif

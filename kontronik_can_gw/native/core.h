@@ -14,6 +14,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "wire.h" /* Generated: fields of the UART frames. */
+
 #ifndef KCG_DATA
 #define KCG_DATA 8   /* Size of a frame's data in bytes: 8, or 64 with CAN FD. */
 #endif
@@ -42,14 +44,27 @@
 #ifndef KCG_FOUND
 #define KCG_FOUND 2  /* UART frames of one kcg_receive that are stored before they are processed. */
 #endif
-enum { KCG_HELD = 43, KCG_BODY = 33, KCG_LONGEST = 44, KCG_PAGES = 64 };
+enum { KCG_PAGES = 64 };
 #define KCG_NEVER INT64_MAX
 #define KCG_BYTE_NS (11 * INT64_C(1000000000) / 115200) /* A byte on the wire (8E1), in ns. */
 
 /* Events of an ESC (twin: telemetry.Event). */
-enum { KCG_LIVE = 1, KCG_INFO = 2, KCG_LINK = 4, KCG_SECOND = 8, KCG_NEW_STATE = 16 };
+enum {
+    KCG_LIVE = 1,      /* Live data were received, or expired. */
+    KCG_INFO = 2,      /* Info was received, or expired. */
+    KCG_LINK = 4,      /* The state of the link, the layout or the device has changed. */
+    KCG_SECOND = 8,    /* A second of the statistics has ended. */
+    KCG_NEW_STATE = 16 /* The first reading, other error bits, or another device. */
+};
 /* States of an ESC's link (twin: telemetry.LinkState). */
-enum { KCG_NEVER_SEEN, KCG_SEARCHING, KCG_OK, KCG_DEGRADED, KCG_LOST, KCG_PORT_ERROR };
+enum {
+    KCG_NEVER_SEEN, /* No byte was received. */
+    KCG_SEARCHING,  /* Bytes, but no frame. */
+    KCG_OK,
+    KCG_DEGRADED,   /* Frames, but too many errors in the last second. */
+    KCG_LOST,       /* Live data have expired. */
+    KCG_PORT_ERROR  /* The port is unusable. */
+};
 
 /* A CAN frame with the same layout as SocketCAN's struct can_frame or canfd_frame. */
 typedef struct {
@@ -74,25 +89,59 @@ enum {
     KCG_OF_UPTIME,  /* Time since gateway[KCG_STARTED_NS], in ms. */
     KCG_OF_ALIVE,   /* The message's alive counter, modulo `div`. */
     KCG_OF_STATUS,  /* Link state. Bit 6: the gateway's state is `place`. Bit 7: info is fresh. */
-    KCG_OF_DIRECTED /* As KCG_OF_LIVE, but negative while the live byte at offset `shift` is the
-                       number of a bit that is set in `mask`. */
+    KCG_OF_DIRECTED /* As KCG_OF_LIVE, but negative while the live byte at offset `state_place` is
+                       the number of a bit that is set in `negative_states`. */
 };
 /* Indices of kcg.gateway. The core writes KCG_ESCS_OK, kcg_init writes KCG_STARTED_NS, and the
    owner writes all others. */
 enum {
-    KCG_ESCS_OK, KCG_GATEWAY_STATE, KCG_CAN_STATE, KCG_ESC_COUNT, KCG_SENT_FRAMES, KCG_REPLACED_FRAMES, KCG_SEND_FAILURES,
-    KCG_RECEIVED_FRAMES, KCG_BUS_OFF_COUNT, KCG_DROPPED_FRAMES, KCG_ID_CONFLICTS, KCG_STARTED_NS, KCG_OF_GATEWAY_COUNT
+    KCG_ESCS_OK, /* Number of ESCs with fresh live data. */
+    KCG_GATEWAY_STATE,
+    KCG_CAN_STATE,
+    KCG_ESC_COUNT,
+    KCG_SENT_FRAMES,
+    KCG_REPLACED_FRAMES, /* Frames that a newer one replaced before they were sent. */
+    KCG_SEND_FAILURES,
+    KCG_RECEIVED_FRAMES,
+    KCG_BUS_OFF_COUNT,
+    KCG_DROPPED_FRAMES,
+    KCG_ID_CONFLICTS,
+    KCG_STARTED_NS, /* Time of kcg_init. */
+    KCG_OF_GATEWAY_COUNT
 };
-/* kcg_signal.wire: type of a field on the wire, little-endian. */
-enum { KCG_U8, KCG_I8, KCG_U16, KCG_I16, KCG_U32 };
-/* kcg_signal.divisor: 1, pole pairs, pole pairs times gear, or number of cells. */
-enum { KCG_BY_ONE, KCG_BY_POLES, KCG_BY_OUTPUT, KCG_BY_CELLS };
+/* kcg_signal.divisor. */
+enum {
+    KCG_BY_ONE,
+    KCG_BY_POLES,  /* Pole pairs. */
+    KCG_BY_OUTPUT, /* Pole pairs times gear. */
+    KCG_BY_CELLS   /* Number of cells. */
+};
 /* Arguments of kcg_count. First the counters of a stream (twin: deframer.Counters), which are
    stored in kcg_esc.count. From KCG_COUNTS on, states of the ESC and sums of counters. */
 enum {
-    KCG_N_BYTES, KCG_N_LIVE_V4, KCG_N_LIVE_LEGACY, KCG_N_INFO_V4, KCG_N_INFO_LEGACY, KCG_N_HEADERS, KCG_N_CRC_ERRORS, KCG_N_UNKNOWN_KINDS,
-    KCG_N_DROPPED_NOISE, KCG_N_DROPPED_CRC, KCG_N_DROPPED_UNKNOWN_KIND, KCG_N_DROPPED_INCOMPLETE, KCG_N_LONG_RUN_BYTES, KCG_N_LONGER_CRCS, KCG_N_LOSSES, KCG_N_LATE_FRAMES, KCG_N_SUSPECT_FRAMES, KCG_COUNTS,
-    KCG_N_LINK_STATE = KCG_COUNTS, KCG_N_LAYOUT, KCG_N_LIVE_FRAMES, KCG_N_INFO_FRAMES, KCG_N_DROPPED_BYTES
+    KCG_N_BYTES,
+    KCG_N_LIVE_V4,
+    KCG_N_LIVE_LEGACY,
+    KCG_N_INFO_V4,
+    KCG_N_INFO_LEGACY,
+    KCG_N_HEADERS,
+    KCG_N_CRC_ERRORS,
+    KCG_N_UNKNOWN_KINDS,
+    KCG_N_DROPPED_NOISE,
+    KCG_N_DROPPED_CRC,
+    KCG_N_DROPPED_UNKNOWN_KIND,
+    KCG_N_DROPPED_INCOMPLETE,
+    KCG_N_LONG_RUN_BYTES,
+    KCG_N_LONGER_CRCS,
+    KCG_N_LOSSES,         /* Times that live data expired. */
+    KCG_N_LATE_FRAMES,    /* Frames that were too old when they were read. */
+    KCG_N_SUSPECT_FRAMES, /* Legacy frames with an impossible operating state. */
+    KCG_COUNTS,
+    KCG_N_LINK_STATE = KCG_COUNTS,
+    KCG_N_LAYOUT,
+    KCG_N_LIVE_FRAMES,
+    KCG_N_INFO_FRAMES,
+    KCG_N_DROPPED_BYTES
 };
 /* kcg_signal.flags. */
 enum {
@@ -132,7 +181,11 @@ typedef struct {
        shift, mask: select a part of the field. mask 0: the whole field. */
     uint8_t kind, wire, place, shift, flags, pieces, page, esc;
     uint32_t mask, first_piece, first_pair, pairs;
-    uint8_t divisor, length, reserved[6]; /* length: in bits. */
+    uint8_t divisor, length; /* length: in bits. */
+    /* KCG_OF_DIRECTED: offset of the state in live data, and a bit for each state in which the
+       value is negative. */
+    uint8_t state_place, reserved;
+    uint32_t negative_states;
     uint64_t not_on;                      /* Bit n: device n does not supply the value. */
     int64_t mul, add, div, most;          /* |x| above `most` is sent as `error`. */
     int64_t low, high;                    /* Limits of the raw value. A float: bits of a double. */
@@ -142,20 +195,32 @@ typedef struct {
 typedef struct {
     uint32_t id; /* Bit 31 is set for a 29-bit id. */
     /* length: in bytes. words: number of 64-bit words in the frame.
-       triggers: events that request the message.
-       crc_at: offset of the E2E CRC in bytes; of a slot: the `page` of its frames.
+       triggers: events that request the message. crc_at: offset of the E2E CRC in bytes.
        escs: number of ESCs with values in the message. */
     uint8_t length, words, flags, triggers, pages, crc_at, escs, fd_flags;
-    /* data_id: E2E data id; of a transfer: start value of its CRC. first_page: index into kcg.page.
+    /* data_id: E2E data id. first_page: index into kcg.page.
        last_alive: highest value of the alive counter, which begins at 0. */
     uint16_t first_signal, signals, data_id, first_page, last_alive;
     uint32_t first_word; /* Index into kcg_plan.constant, which has `words` for each page. */
     uint32_t first_esc;  /* Index into kcg_plan.esc_of, which has `escs` numbers for the message. */
     int64_t cycle, delay, phase; /* In ns. delay: minimum distance between two frames. */
 } kcg_message;
-/* Settings of an ESC. timeout: in ns. crc_errors: CRC errors in a second that make the link
-   KCG_DEGRADED. cells: number of cells; 0: the number that the ESC reports. */
-typedef struct { int64_t timeout; uint32_t crc_errors, poles, gear_numerator, gear_denominator; uint8_t cells, reserved[7]; } kcg_settings;
+/* A slot, besides its kcg_message. */
+typedef struct {
+    uint64_t watched;  /* Bits whose change requests the slot. 0: each event in `triggers` does. */
+    uint16_t crc_seed; /* Start value of the CRC of its transfers. */
+    uint8_t page;      /* `page` of its frames. */
+    uint8_t reserved[5];
+} kcg_slot_row;
+/* Settings of an ESC. */
+typedef struct {
+    int64_t timeout;     /* Live data expire after this time, in ns. */
+    uint32_t crc_errors; /* CRC errors in a second that make the link KCG_DEGRADED. */
+    uint32_t poles;      /* Pole pairs. */
+    uint32_t gear_numerator, gear_denominator;
+    uint8_t cells;       /* Number of cells. 0: the number that the ESC reports. */
+    uint8_t reserved[7];
+} kcg_settings;
 /* All constant tables. */
 typedef struct {
     const kcg_message *message;
@@ -169,75 +234,111 @@ typedef struct {
     const uint16_t *listener, *first_listener;
     uint32_t words;                        /* Length of `constant`. */
     uint16_t messages, escs, pages, slots; /* In `message`, the slots follow the messages. */
-    /* For each slot, the bits whose change requests the slot. 0: each event in `triggers` does. */
-    const uint64_t *watched;
+    const kcg_slot_row *slot_row;
 } kcg_plan;
 
 /* State of an ESC. Fields that are used often are at the beginning, because the instructions of
-   small processors reach them with short offsets.
-   has_live, has_info: the data are fresh. had_live, had_info: some were received since the start.
-   has_time: live_ns is valid. turns: the electrical speed is not 0. cells: the number in use.
-   need: bytes that are missing before the next decision of the deframer. */
+   small processors reach them with short offsets. Times are in ns. */
 typedef struct {
-    uint8_t has_live, has_info, had_live, had_info, has_time, turns, cells, held_count, need, arrivals, blame, reported, link, layout;
-    int32_t rate, power; /* rate: in 0.1 Hz, or -1 if unknown. power: in mW. */
+    uint8_t has_live, has_info; /* The data are fresh. */
+    uint8_t had_live, had_info; /* Data were received since the start, in the current layout. */
+    uint8_t has_time;           /* live_ns is valid. */
+    uint8_t turns;              /* The electrical speed is not 0. */
+    uint8_t cells;              /* The number of cells in use. */
+    uint8_t held_count;         /* Bytes in `held`. */
+    uint8_t need;               /* Bytes that the deframer needs for its next decision. */
+    uint8_t arrivals;           /* Entries of arrival_bound and arrival_end. */
+    uint8_t blame;              /* Counter for bytes dropped before `blame_until`. */
+    uint8_t reported;           /* Events that were not yet returned. */
+    uint8_t link;               /* State of the link. */
+    uint8_t layout;             /* 0: unknown, 1: V4, 2: legacy. */
+    int32_t rate;               /* Live frames per second in 0.1 Hz, or -1 if unknown. */
+    int32_t power;              /* In mW. */
     kcg_settings settings;
     uint64_t count[KCG_COUNTS];
     /* Live frames, dropped bytes, bytes and CRC errors at the beginning of the current second. */
     uint32_t window[4];
-    /* Positions in the stream. They overflow, so compare them by their difference. */
+    /* Positions in the stream. They overflow, so compare them by their difference.
+       base: of the first held byte. blame_until: end of the last frame that was rejected. */
     uint32_t base, blame_until;
-    uint64_t energy; /* In mW s. energy_rest: the rest in mW ns. */
-    int64_t energy_rest, run_time;
-    int64_t live_ns, live_bound, info_bound, last_info_ns, window_ns, interval;
-    int64_t arrival_bound[KCG_HELD + 1];
-    uint32_t arrival_end[KCG_HELD + 1];
-    /* Increases when live data or info data change or expire. */
-    uint32_t generation;
-    uint8_t live[KCG_BODY], info[KCG_BODY], held[KCG_HELD + KCG_LONGEST];
+    uint64_t energy;            /* In mW s. */
+    int64_t energy_rest;        /* The rest in mW ns. */
+    int64_t run_time;
+    int64_t live_ns, live_bound; /* Newest live frame: its time, and the earliest possible time. */
+    int64_t info_bound, last_info_ns;
+    int64_t window_ns;          /* Beginning of the current second. */
+    int64_t interval;           /* Mean time between live frames in the last second, or 0. */
+    /* Held bytes before the position arrival_end arrived at arrival_bound at the earliest. */
+    int64_t arrival_bound[KCG_MAX_HELD + 1];
+    uint32_t arrival_end[KCG_MAX_HELD + 1];
+    uint32_t generation;        /* Increases when live data or info data change or expire. */
+    uint8_t live[KCG_BODY_SIZE], info[KCG_BODY_SIZE], held[KCG_MAX_HELD + KCG_LONGEST_FRAME];
 } kcg_esc;
 
-/* State of a message or slot. */
+/* State of a message or slot. Times are in ns. */
 typedef struct {
-    /* alive: the alive counter. In the first slot with the id of a transfer: the next transfer's
-       number. */
-    uint16_t place_in_heap, alive;
-    /* page: index of the next page; of a slot: its state. why: reasons why it is pending, or 0. */
-    uint8_t page, pages_to_send, cycle_deferred, why;
-    /* last: time of the last frame. cycle_due, deferred: next times, or KCG_NEVER. since: time
-       since which it is pending. */
-    int64_t last, cycle_due, deferred, since;
+    uint16_t place_in_heap;
+    uint16_t alive;         /* The alive counter. */
+    uint8_t page;           /* Index of the next page. */
+    uint8_t pages_to_send;  /* Number of pages that must be sent without a further event. */
+    uint8_t cycle_deferred; /* A cycle was due while the minimum distance did not allow a frame. */
+    uint8_t why;            /* Reasons why it is pending, or 0. */
+    int64_t last;           /* Time of the last frame. */
+    int64_t cycle_due;      /* Next cycle, or KCG_NEVER. */
+    int64_t deferred;       /* When the minimum distance allows the next frame, or KCG_NEVER. */
+    int64_t since;          /* Time since which it is pending. */
 } kcg_sending;
 
-/* A UART frame that was found but not processed. end: its position in the stream. */
-typedef struct { uint32_t end; uint8_t is_info, layout, length, body[KCG_BODY]; } kcg_found;
+/* State of a slot, besides its kcg_sending. */
+typedef struct {
+    uint64_t seen_bits;      /* The watched bits of the last event or frame. */
+    uint64_t frames_sent;
+    uint8_t state;           /* Started, changed since the last frame, `seen_bits` is valid. */
+    uint8_t transfer_number; /* Next transfer of this id, kept in the first slot with the id. */
+    uint8_t reserved[6];
+} kcg_slot;
+
+/* A UART frame that was found but not processed. */
+typedef struct {
+    uint32_t end; /* Position in the stream. */
+    uint8_t is_info, layout;
+    uint8_t body[KCG_BODY_SIZE];
+} kcg_found;
 
 /* The core. The owner writes only `mask` and `gateway`. */
 typedef struct {
     const kcg_plan *plan;
     kcg_esc *esc;
-    kcg_sending *sending;
-    /* Messages that are sent on change: bits of the last frame of each page. Slots: the watched
-       bits, then the number of frames sent. */
+    kcg_sending *sending; /* For the messages, then for the slots. */
+    kcg_slot *slot;
+    /* Bits of the last frame of each page, for messages that are sent on change. */
     uint64_t *last;
     uint8_t *page;   /* For each page: is its last frame known, must it be sent. */
     uint8_t *report; /* ESCs with events that were not yet returned, oldest first. */
     /* heap: messages by their next deadline. pending: messages to be sent. */
     uint16_t *heap, *pending;
-    uint32_t pendings, taken, heaped, reports;
-    uint32_t mask; /* Events that functions return. */
-    int read_esc;  /* ESC whose bytes are being processed, or -1. */
-    uint32_t found_count, found_at, read_end;
-    int64_t read_now, read_shown, read_bound;
-    int64_t second, next_expiry;
+    uint32_t pendings, heaped, reports; /* Number of entries of `pending`, `heap` and `report`. */
+    uint32_t taken;        /* Frames that the last kcg_take returned. */
+    uint32_t mask;         /* Events that functions return. */
+    int read_esc;          /* ESC whose bytes are being processed, or -1. */
+    uint32_t found_count, found_at; /* Frames in `found`; how many of them were processed. */
+    uint32_t read_end;     /* Position in the stream after the bytes that were read. */
+    int64_t read_now;      /* Time of the read. */
+    int64_t read_bound;    /* The last byte arrived at this time at the earliest. */
+    int64_t read_shown;    /* Time that the last byte is given. */
+    int64_t second;        /* Beginning of the current second of the gateway's values. */
+    int64_t next_expiry;   /* The earliest deadline of all ESCs; 0: unknown. */
     int64_t gateway[KCG_OF_GATEWAY_COUNT]; /* States and counters of the gateway. */
-    uint8_t stopping, again;
+    uint8_t stopping;      /* kcg_stop was called. */
+    uint8_t again;         /* The last kcg_receive returned KCG_AGAIN. */
     kcg_found found[KCG_FOUND];
 } kcg;
 
-/* Size in bytes of the memory for kcg_init. `messages` includes slots. */
-#define KCG_SIZE(messages, escs, pages, words) \
-    (sizeof(kcg) + (escs) * (sizeof(kcg_esc) + 1) + (messages) * (sizeof(kcg_sending) + 2 * sizeof(uint16_t)) + (pages) + (words) * sizeof(uint64_t))
+/* Size in bytes of the memory for kcg_init. */
+#define KCG_SIZE(messages, slots, escs, pages, words) \
+    (sizeof(kcg) + (escs) * (sizeof(kcg_esc) + 1) + (slots) * sizeof(kcg_slot) + \
+     ((messages) + (slots)) * (sizeof(kcg_sending) + 2 * sizeof(uint16_t)) + (pages) + \
+     (words) * sizeof(uint64_t))
 
 #if !KCG_SOURCE
 /* KCG_DATA and KCG_FOUND change structures, so all files of a program must agree on them. The names
@@ -313,9 +414,9 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
    are packed again with newer values. The rest of a transfer that was sent in part is dropped. */
 void kcg_sent(kcg *g, int64_t now, uint32_t count);
 #if KCG_SLOTS
-/* Slots (twin: slots.py) are messages that their owner starts and stops. A slot has one page, one
-   ESC and at most 8 bytes (a transfer: 16 bytes, with KCG_DATA 64). `cycle` counts from the last
-   frame.
+/* Slots (twin: core/slots.py) are messages that their owner starts and stops. A slot has one page,
+   one ESC and at most 8 bytes (a transfer: 16 bytes, with KCG_DATA 64). `cycle` counts from the
+   last frame.
    slot: a number from 0, less than kcg_plan.slots.
    The owner may write the rows of a stopped slot in `message`, `signal` and `piece` at any time.
    While a slot is started it may write all rows except the signals, and must then call
@@ -339,7 +440,8 @@ uint64_t kcg_slot_sent(const kcg *g, uint32_t slot);
 void kcg_end(kcg *g, int esc);
 /* Reads a value: x * over / by, in steps. Returns 0 if it is not available.
    s: a row of the plan, or another row that refers to the plan. */
-int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by, int64_t *over);
+int kcg_value(const kcg *g, const kcg_signal *s, int64_t now, int64_t *x, int64_t *by,
+              int64_t *over);
 /* Returns a counter or state of an ESC: KCG_N_... */
 uint64_t kcg_count(const kcg_esc *e, int what);
 /* Returns the CRC-32 of `size` bytes, continued from `crc`, which is 0 at the beginning. With
@@ -350,8 +452,6 @@ uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
    kcg_plan, kcg_esc and kcg_frame. A caller that cannot include this file compares them with its
    own sizes. */
 uint32_t kcg_sizes(uint32_t what);
-/* Returns the fields of live data and of info data, as codes of Python's struct. */
-const char *kcg_wire(void);
 #endif
 
 #ifdef __cplusplus

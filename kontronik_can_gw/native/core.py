@@ -1,4 +1,4 @@
-"""The core in C in place of the one in Python (core/python_core.py): the same surface, and what is read of it has the same names."""
+"""The core in C behind the interface of the core in Python (core/python_core.py)."""
 
 import ctypes as c
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
-from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, held_settings
+from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, SlotRow, held_settings
 from kontronik_can_gw.native.scale import END_OF_TIME
 from kontronik_can_gw.native.slots import (
     NativeSlot,
@@ -31,18 +31,26 @@ from kontronik_can_gw.status import GatewayStatus
 _MAX_FRAMES = 256
 _WORD = (1 << 64) - 1
 _LIVE_IN_PYTHON = "a PDO with a value that it does not have is sent in Python"
-_Plan, _Esc, _Core = structure("kcg_plan"), structure("kcg_esc"), structure("kcg")
+_Core = structure("kcg")
+_Plan = structure("kcg_plan")
+_Esc = structure("kcg_esc")
 _Sending = structure("kcg_sending")
 
 
 def _array(kind: Any, rows: Any) -> Any:
+    """Return a ctypes array of the rows. An empty table has one row of zeros."""
     if isinstance(rows, Rows) and rows:
         return (kind * len(rows)).from_buffer(rows.data)
     return (kind * max(1, len(rows)))(*rows)
 
 
+def _part(memory: Any, kind: Any, count: int, address: int) -> Any:
+    """Return an array in the core's memory."""
+    return (kind * count).from_buffer(memory, address - c.addressof(memory))
+
+
 def _check(esc: int, now: int, escs: int = 1) -> None:
-    """What a damaged capture may hold never reaches the core."""
+    """Refuse arguments that the core does not check. A damaged capture can contain them."""
     if not 0 <= esc < escs:
         raise IndexError(f"ESC {esc}")
     if not 0 <= now < END_OF_TIME:
@@ -50,9 +58,11 @@ def _check(esc: int, now: int, escs: int = 1) -> None:
 
 
 class NativeCore:
-    """As Core. NotInCore where the core in C cannot express the layout or an ESC's settings.
+    """The core in C (twin: PythonCore).
 
-    ``slots``: number of slots of each ESC that C runs. Python runs further slots, and slots with values that C does not have.
+    Raises NotInCore if it cannot express the layout or an ESC's settings. ``slots`` is the number
+    of slots of each ESC that C runs. Python runs further slots, and slots with values that C does
+    not have.
     """
 
     language = "C"
@@ -67,15 +77,16 @@ class NativeCore:
         slots: int = 0,
     ) -> None:
         tables = Tables(layout, escs, silent)
-        if tables.wire not in ("", library.kcg_wire().decode()):
-            raise NotInCore(f"fields on the wire: {tables.wire}")
         self._places = reserve(tables, slots)
         self.slots_of_esc = len(self._places[0])
         self.library = library
         self._make(tables, now)
         self.status = cast(GatewayStatus, NativeStatus.from_buffer(self.state.gateway))
         self.status.esc_count = len(escs)
-        self.escs = [NativeEsc(*pair) for pair in zip(escs, self.esc_states, strict=True)]
+        self.escs = [
+            NativeEsc(settings, state)
+            for settings, state in zip(escs, self.esc_states, strict=True)
+        ]
         self.own_ids: dict[int, Owner] = own_ids(layout)
         self._slots = Slots(self.escs, self.status)
         self._followers: Sequence[Follower] = ()
@@ -84,29 +95,31 @@ class NativeCore:
         self.shortest_timeout_ns = min(esc.timeout_ns for esc in escs)
 
     def _make(self, tables: Tables, now: int) -> None:
-        """``state``, ``esc_states``: what is in the core's memory."""
+        """Start the core. ``state``, ``esc_states``, ``sending`` and ``pending`` are its memory."""
         self.pages = tables.pages
-        arrays = {name: _array(*table) for name, table in tables.arrays.items()}
-        self.messages, self.signals, self.pieces, self.constants = (
-            arrays[name] for name in ("message", "signal", "piece", "constant")
-        )
-        self.watched = _array(c.c_uint64, tables.watched)
-        self._kept = [*arrays.values(), self.watched]
-        self.plan = _Plan(
-            *map(c.addressof, arrays.values()), *tables.counts.values(), c.addressof(self.watched)
-        )
-        size = self.library.kcg_size(c.byref(self.plan))
+        arrays = {}
+        for name, (kind, rows) in tables.arrays.items():
+            arrays[name] = _array(kind, rows)
+        self.messages = arrays["message"]
+        self.signals = arrays["signal"]
+        self.pieces = arrays["piece"]
+        self.constants = arrays["constant"]
+        self.slot_rows = _array(SlotRow, tables.slots)
+        self._kept = [*arrays.values(), self.slot_rows]
+        addresses = {name: c.addressof(array) for name, array in arrays.items()}
+        slot_row = c.addressof(self.slot_rows)
+        self.plan = _Plan(**addresses, **tables.counts, slot_row=slot_row)
+        plan = c.byref(self.plan)
+        size = self.library.kcg_size(plan)
         self._memory = (c.c_uint64 * (size // 8 + 1))()
         settings = _array(Settings, tables.settings)
-        self.core = self.library.kcg_init(self._memory, c.byref(self.plan), settings, now)
+        self.core = self.library.kcg_init(self._memory, plan, settings, now)
         self.state = _Core.from_buffer(self._memory)
-        begin = self.state.esc - c.addressof(self._memory)
-        self.esc_states = (_Esc * len(tables.settings)).from_buffer(self._memory, begin)
         count = self.plan.messages + self.plan.slots
-        begin = self.state.sending - c.addressof(self._memory)
-        self.sending = (_Sending * count).from_buffer(self._memory, begin)
-        begin = self.state.pending - c.addressof(self._memory)
-        self.pending = (c.c_uint16 * count).from_buffer(self._memory, begin)
+        memory = self._memory
+        self.esc_states = _part(memory, _Esc, len(tables.settings), self.state.esc)
+        self.sending = _part(memory, _Sending, count, self.state.sending)
+        self.pending = _part(memory, c.c_uint16, count, self.state.pending)
         self._frames = (Frame * _MAX_FRAMES)()
         self._raw = memoryview(self._frames).cast("B")
 
@@ -120,12 +133,12 @@ class NativeCore:
         self.choose_events()
 
     def choose_events(self) -> None:
-        """Be given the events that somebody in Python follows."""
-        events = Event.LINK | self._slots.triggers  # which is followed here in any case
+        """Let the core report the events that Python code follows."""
+        events = Event.LINK | self._slots.triggers  # always needed here
         for wanted, _ in self._followers:
             events |= wanted
         self.reports_live = bool(events & Event.LIVE)
-        """True while somebody follows each live frame."""
+        """True while a follower needs each live frame."""
         self.note = _LIVE_IN_PYTHON if self.reports_live else ""
         self.state.mask = events
 
@@ -148,7 +161,10 @@ class NativeCore:
                 signal.esc = esc
         for number, row in enumerate(rows.pieces):
             self.pieces[place.piece + number] = row
-        self.watched[place.number] = plan.watched
+        slot_row = self.slot_rows[place.number]
+        slot_row.watched = plan.watched
+        slot_row.crc_seed = plan.seed or 0
+        slot_row.page = settings.page
         message = self.messages[place.message]
         write_message(message, settings, len(rows.signals))
         for word in range(2):
@@ -160,26 +176,33 @@ class NativeCore:
         _check(esc, now, len(self.escs))
         receive, core = self.library.kcg_receive, self.core
         for begin in range(0, len(data) or 1, KCG.MAX_READ):
-            part = data[begin : begin + KCG.MAX_READ] if len(data) > KCG.MAX_READ else data
-            while (found := receive(core, esc, part, len(part), now, since)) >= KCG.AGAIN:
-                self._follow_all(found & ~KCG.AGAIN, now)
-            self._follow_all(found, now)
+            part = data
+            if len(data) > KCG.MAX_READ:
+                part = data[begin : begin + KCG.MAX_READ]
+            event = receive(core, esc, part, len(part), now, since)
+            while event >= KCG.AGAIN:
+                self._follow_all(event & ~KCG.AGAIN, now)
+                event = receive(core, esc, part, len(part), now, since)
+            self._follow_all(event, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         _check(esc, now, len(self.escs))
-        self._follow_all(self.library.kcg_port(self.core, esc, is_open, now), now)
+        event = self.library.kcg_port(self.core, esc, is_open, now)
+        self._follow_all(event, now)
 
     def expire(self, now: int) -> None:
         _check(0, now)
-        self._follow_all(self.library.kcg_expire(self.core, now), now)
+        event = self.library.kcg_expire(self.core, now)
+        self._follow_all(event, now)
 
     def advance(self, now: int) -> None:
         _check(0, now)
-        self._follow_all(self.library.kcg_advance(self.core, now), now)
+        event = self.library.kcg_advance(self.core, now)
+        self._follow_all(event, now)
         self._slots.advance(now)
 
     def advance_in_python(self, now: int) -> None:
-        """The same for what C does not know: the slots in Python."""
+        """Let time pass for the slots in Python only."""
         self._slots.advance(now)
 
     def next_deadline(self) -> int:
@@ -187,20 +210,21 @@ class NativeCore:
         return min(found, self._slots.next_deadline())
 
     def deadline_in_python(self) -> int:
-        """When ``advance_in_python`` has something to do; 0 while one of these slots is pending."""
+        """Return the next deadline of ``advance_in_python``; 0 while one of its slots is pending."""
         return 0 if self._slots.is_pending else self._slots.next_deadline()
 
     def turns(self) -> Turns:
-        """Whole turns of a loop with this core."""
+        """Return the turns of a loop with this core."""
         return Turns(self.library, self.core, len(self.escs))
 
-    def follow(self, found: int, now: int) -> None:
-        """Follow an event that a turn came back with; if there are others it comes back with each."""
-        self._follow(found >> 8, found & 0xFF, now)
+    def follow(self, event: int, now: int) -> None:
+        """Follow an event that a turn returned. Further events are returned one by one."""
+        self._follow(event >> 8, event & 0xFF, now)
 
     def follow_others(self, now: int) -> None:
-        """Follow these, where the rest of the turn is the loop's."""
-        self._follow_all(self.library.kcg_next_event(self.core), now)
+        """Follow all further events of a turn, if the loop makes the rest of it."""
+        event = self.library.kcg_next_event(self.core)
+        self._follow_all(event, now)
 
     @property
     def is_pending(self) -> bool:
@@ -234,11 +258,11 @@ class NativeCore:
     def stop(self, now: int) -> None:
         self.library.kcg_stop(self.core, now)
 
-    def _follow_all(self, found: int, now: int) -> None:
-        """Follow what a call of the core returned, and what else there is."""
-        while found >= 0:
-            self._follow(found >> 8, found & 0xFF, now)
-            found = self.library.kcg_next_event(self.core)
+    def _follow_all(self, event: int, now: int) -> None:
+        """Follow the event that a call of the core returned, and all further ones."""
+        while event >= 0:
+            self._follow(event >> 8, event & 0xFF, now)
+            event = self.library.kcg_next_event(self.core)
 
     def _follow(self, esc: int, events: int, now: int) -> None:
         if events & Event.LINK:

@@ -12,8 +12,8 @@ from typing import Any
 from kontronik_can_gw import __version__
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.header import KCG
-from kontronik_can_gw.native.objects import FOLDER
-from kontronik_can_gw.native.rows import NotInCore, Settings
+from kontronik_can_gw.native.objects import FOLDER, wire_header
+from kontronik_can_gw.native.rows import Settings
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.signals.plan import Layout
 
@@ -32,8 +32,6 @@ def exported(
     """Text of each file by its name. NotInCore where the core in C cannot express the layout or an ESC's settings."""
     tables = Tables(layout, escs, silent)
     core_c, core_h = ((FOLDER / name).read_text(encoding="utf-8") for name in ("core.c", "core.h"))
-    if tables.wire not in core_c:
-        raise NotInCore(f"fields on the wire: {tables.wire}")
     for name, value in _options(layout, tables).items():
         core_h, count = re.subn(rf"(#define {name} +)\d+", rf"\g<1>{value}", core_h)
         assert count == 1, name
@@ -57,6 +55,7 @@ def exported(
     texts = {
         "core.c": core_c,
         "core.h": core_h,
+        "wire.h": wire_header(),
         "tables.h": _header(dbc, tables, names, escs),
         "tables.c": "\n".join(_tables(tables)),
         EXAMPLE: (folder / EXAMPLE).read_text(encoding="utf-8"),
@@ -94,7 +93,7 @@ def _header(dbc: str, tables: Tables, names: Sequence[str], escs: Sequence[EscSe
         "/* ESCs: the number of each in calls of the core. */",
         f"enum {{ {', '.join([*places, 'KCG_ESCS'])} }};\n",
         "/* Bytes for kcg_init. */",
-        f"#define KCG_MEMORY KCG_SIZE(KCG_MESSAGES, KCG_ESCS, {tables.pages}, {len(tables.constants)})\n",
+        f"#define KCG_MEMORY KCG_SIZE(KCG_MESSAGES, 0, KCG_ESCS, {tables.pages}, {len(tables.constants)})\n",
         "#ifdef __cplusplus",
         'extern "C" {',
         "#endif",
@@ -164,7 +163,8 @@ def _id(row: Any) -> str:
 
 def _names(prefix: str, texts: Sequence[str]) -> list[str]:
     """A C identifier for each, no two the same, and none that core.h has, as an id or a length neither."""
-    taken = set(re.findall(r"KCG_\w+", (FOLDER / "core.h").read_text(encoding="utf-8")))
+    headers = wire_header() + (FOLDER / "core.h").read_text(encoding="utf-8")
+    taken = set(re.findall(r"KCG_\w+", headers))
     found: dict[str, None] = {}
     for text in texts:
         name = base = prefix + re.sub(r"\W", "_", text, flags=re.ASCII)

@@ -1,4 +1,7 @@
-"""Structures and enumerations of the core's headers, read from their text: they are written down nowhere else."""
+"""Structures, constants and functions of the core's headers, read from the text of the headers.
+
+So each of them is defined in one place.
+"""
 
 import ctypes as c
 import re
@@ -7,11 +10,11 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-from kontronik_can_gw.native.objects import FOLDER, OPTIONS
+from kontronik_can_gw.native.objects import FOLDER, OPTIONS, wire_header
 
 
 class NotInCore(ValueError):
-    """The core in C does not have this: the message in words."""
+    """The core in C cannot do this. The message explains what."""
 
 
 class _PollFd(c.Structure):
@@ -19,7 +22,10 @@ class _PollFd(c.Structure):
 
 
 class _Row(c.Structure):
-    """A row of a table. A number that its field cannot hold is NotInCore: ctypes would cut it off."""
+    """A row of a table. A number that its field cannot hold raises NotInCore.
+
+    ctypes would silently cut it off.
+    """
 
     def __init__(self, *values: Any, **named: Any) -> None:
         super().__init__()
@@ -33,60 +39,82 @@ class _Row(c.Structure):
             raise NotInCore(f"{name} {value} does not fit")
 
 
-_ROWS = {"kcg_piece", "kcg_pair", "kcg_signal", "kcg_message", "kcg_settings"}
+_ROWS = {"kcg_piece", "kcg_pair", "kcg_signal", "kcg_message", "kcg_settings", "kcg_slot_row"}
 _TYPES = {f"{name}_t": getattr(c, f"c_{name}") for name in ("int16", "int32", "int64")}
 _TYPES |= {f"{name}_t": getattr(c, f"c_{name}") for name in ("uint8", "uint16", "uint32", "uint64")}
 _TYPES |= {"int": c.c_int, "double": c.c_double, "size_t": c.c_size_t, "pollfd": _PollFd}
 _FIELD = re.compile(r"(\*?)(\w+)(?:\[(.+)\])?")
-_TEXT = re.sub(
-    r"/\*.*?\*/",
-    "",
-    "".join((FOLDER / name).read_text(encoding="utf-8") for name in ("core.h", "offline.h", "linux.h")),
-    flags=re.DOTALL,
-)  # fmt: skip
+_FILES = ("core.h", "offline.h", "linux.h")
+
+
+def _text_without_comments() -> str:
+    texts = [wire_header()]
+    for name in _FILES:
+        texts.append((FOLDER / name).read_text(encoding="utf-8"))
+    return re.sub(r"/\*.*?\*/", "", "".join(texts), flags=re.DOTALL)
+
+
+_TEXT = _text_without_comments()
 _STRUCTURES = {
     name: (kind, body)
     for kind, body, name in re.findall(r"typedef (struct|union) \{(.*?)\} (\w+);", _TEXT, re.DOTALL)
 }
-CONSTANTS = {name: int(value) for name, value in re.findall(r"#define (KCG_\w+) +(\d+)\n", _TEXT)}
-"""Every enumerator and option by name, as the shared objects have them."""
-CONSTANTS |= {name[2:]: int(value) for name, _, value in (part.partition("=") for part in OPTIONS)}
+CONSTANTS: dict[str, int] = {}
+"""Every enumerator and option by name, with its value in the shared objects."""
+for _name, _value in re.findall(r"#define (KCG_\w+) +(\d+)\s*?\n", _TEXT):
+    CONSTANTS[_name] = int(_value)
+for _option in OPTIONS:
+    _name, _, _value = _option.removeprefix("-D").partition("=")
+    CONSTANTS[_name] = int(_value)
 
 
 def _number(text: str) -> int:
-    """Of an expression: a sum of numbers, names and shifted numbers."""
-    found = 0
+    """Return the value of a sum of numbers, names and shifted numbers."""
+    total = 0
     for part in text.split("+"):
-        number, _, shift = (word.strip() for word in part.partition("<<"))
-        found += (CONSTANTS[number] if number in CONSTANTS else int(number)) << int(shift or 0)
-    return found
+        word, _, shift = part.partition("<<")
+        word = word.strip()
+        number = CONSTANTS[word] if word in CONSTANTS else int(word)
+        total += number << int(shift or 0)
+    return total
 
 
 def _enumerations() -> list[list[str]]:
+    """Return the names of each enumeration, and enter their values in CONSTANTS."""
     found = []
     for body in re.findall(r"enum \{(.*?)\}", _TEXT, re.DOTALL):
-        parts = [part.partition("=") for part in body.split(",")]
-        found.append([name.strip() for name, _, _ in parts])
+        names = []
         number = 0
-        for name, _, value in parts:
-            number = _number(value) if value else number
-            CONSTANTS[name.strip()] = number
+        for part in body.split(","):
+            word, _, value = part.partition("=")
+            name = word.strip()
+            if value:
+                number = _number(value)
+            CONSTANTS[name] = number
             number += 1
+            names.append(name)
+        found.append(names)
     return found
 
 
 _ENUMERATIONS = _enumerations()
-KCG: Any = SimpleNamespace(**{n.removeprefix("KCG_"): value for n, value in CONSTANTS.items()})
-"""The same as attributes, without the prefix."""
+KCG: Any = SimpleNamespace()
+"""The constants as attributes, without the prefix."""
+for _name, _number_of in CONSTANTS.items():
+    setattr(KCG, _name.removeprefix("KCG_"), _number_of)
 
 
 def enumeration(first: str, prefix: str = "KCG_") -> list[str]:
-    """The names that begin with the prefix, without it and in small letters, of the enumeration that begins with ``first``."""
+    """Return the names in the enumeration that begins with ``first``.
+
+    Names without the prefix are left out. The others are in lower case, without it.
+    """
     (names,) = (names for names in _ENUMERATIONS if names[0] == first)
     return [name.removeprefix(prefix).lower() for name in names if name.startswith(prefix)]
 
 
-def _typed(of: str, pointer: str, texts: Container[str]) -> Any:
+def _ctype(of: str, pointer: str, texts: Container[str]) -> Any:
+    """Return the ctypes type. Pointers are addresses, except those to a type in ``texts``."""
     if pointer:
         return c.c_char_p if of in texts else c.c_void_p
     return None if of == "void" else structure(of)
@@ -94,24 +122,34 @@ def _typed(of: str, pointer: str, texts: Container[str]) -> Any:
 
 @cache
 def structure(name: str) -> Any:
-    """The ctypes class of a structure: pointers are addresses, but for texts."""
+    """Return the ctypes class of a structure or a number. Pointers to char are texts."""
     if name in _TYPES:
         return _TYPES[name]
     kind, body = _STRUCTURES[name]
     fields: list[tuple[str, Any]] = []
     for of, names in re.findall(r"(?:const )?(?:struct )?(\w+) ([^;]+);", body):
         for each in names.split(","):
-            pointer, field, length = _FIELD.fullmatch(each.strip()).groups()  # type: ignore[union-attr]
-            typed = _typed(of, pointer, ("char",))
-            fields.append((field, typed * _number(length) if length else typed))
-    base = c.Union if kind == "union" else _Row if name in _ROWS else c.Structure
+            match = _FIELD.fullmatch(each.strip())
+            assert match is not None, each
+            pointer, field, length = match.groups()
+            ctype = _ctype(of, pointer, ("char",))
+            if length:
+                ctype = ctype * _number(length)
+            fields.append((field, ctype))
+    base: Any = c.Structure
+    if kind == "union":
+        base = c.Union
+    elif name in _ROWS:
+        base = _Row
     return type(name, (base,), {"_fields_": fields})
 
 
 def functions() -> Iterator[tuple[str, list[Any]]]:
-    """Of each function its name, and the types of its result and arguments; bytes are texts, too."""
+    """Yield each function's name, and the types of its result and then of its arguments."""
+    texts = ("char", "uint8_t")
     found = re.findall(r"^(?:const )?(\w+) (\*?)(kcg_\w+)\(([^)]*)\);", _TEXT, re.MULTILINE)
-    for of, pointer, name, arguments in found:
-        given: list[tuple[str, str]] = re.findall(r"(?:const )?(\w+) (\*?)\w+", arguments)
-        types = [(of, pointer), *given]
-        yield name, [_typed(*each, ("char", "uint8_t")) for each in types]
+    for result, is_pointer, name, arguments in found:
+        types = [_ctype(result, is_pointer, texts)]
+        for of, pointer in re.findall(r"(?:const )?(\w+) (\*?)\w+", arguments):
+            types.append(_ctype(of, pointer, texts))
+        yield name, types

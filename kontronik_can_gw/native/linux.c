@@ -1,6 +1,9 @@
-/* The core at work on Linux: turns of the gateway's loop, as long as nothing but plain reads of ESCs and frames that are due are to be
-   done. Twins: runtime/loop.py (Loop.turn), poller.py, serial_port.py and esc_port.py (what is read, and since when it can have come),
-   socketcan_port.py (what is sent). Everything else is the loop's, whose own turn follows at once with what is ready. */
+/* Turns of the gateway's loop on Linux, as long as they only read ESCs and send due frames.
+
+   The twins in Python describe each rule: runtime/loop.py (Loop.turn), runtime/poller.py,
+   runtime/ports (serial_port.py and esc_port.py: reading, and since when bytes can have arrived),
+   gateway/transmit_queue.py (frames that wait) and runtime/can/socketcan_port.py (sending). The
+   loop does everything else: its next turn follows at once with all that is ready. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <poll.h>
@@ -14,10 +17,11 @@
 #include "linux.h"
 
 #define MS INT64_C(1000000)
-#define MAX_FULL (250 * MS) /* how long the bus may take nothing */
-#define ASK_ALL (10 * MS) /* by how much values may seem older, where others come meanwhile, for the sake of fewer questions */
-#define LOOK (100 * MS) /* how often ports are looked at: with echo on, what an ESC sends goes back to it */
-enum { AT_ONCE = KCG_AT_ONCE, CLASSIC_SIZE = 16, FD_SIZE = 72 };
+#define HOUR (3600000 * MS)
+#define MAX_FULL (250 * MS)    /* The loop handles a bus that has been full for this long. */
+#define MAX_UNPOLLED (10 * MS) /* Saves polls: values of quiet ports may appear older by this. */
+#define CHECK_EACH (100 * MS)  /* Between checks of settings: an echo would send to the ESC. */
+enum { CLASSIC_SIZE = 16, FD_SIZE = 72 }; /* Size of struct can_frame and struct canfd_frame. */
 
 static int64_t now_ns(void)
 {
@@ -26,296 +30,381 @@ static int64_t now_ns(void)
     return t.tv_sec * INT64_C(1000000000) + t.tv_nsec;
 }
 
-/* Record a call of the core. There is room: a read asked for it, and for that of the turn. */
+/* Records a call of the core. `has_room` was true for it and for the kcg_advance of the turn. */
 static void note(kcg_turns *t, int kind, int esc, const uint8_t *data, uint32_t size, int64_t came)
 {
-    if (!t->records)
+    if (!t->request.is_recorded)
         return;
-    kcg_entry e = {t->now, came, size, (uint8_t)kind, (uint8_t)esc, {0, 0}};
-    memcpy(t->ring + t->recorded, &e, sizeof e);
+    uint8_t *p = t->ring + t->result.recorded;
+    kcg_entry e = {t->times.now, came, size, (uint8_t)kind, (uint8_t)esc, {0, 0}};
+    memcpy(p, &e, sizeof e);
     if (size)
-        memcpy(t->ring + t->recorded + sizeof e, data, size);
-    t->recorded += (uint32_t)(sizeof e + (size + 7) / 8 * 8);
+        memcpy(p + sizeof e, data, size);
+    t->result.recorded += (uint32_t)(sizeof e + (size + 7) / 8 * 8);
 }
 
 static int has_room(const kcg_turns *t, size_t size)
 {
-    return !t->records || sizeof t->ring - t->recorded >= size + 2 * sizeof(kcg_entry);
+    size_t left = sizeof t->ring - t->result.recorded;
+    return !t->request.is_recorded || left >= size + 2 * sizeof(kcg_entry);
 }
 
-/* Read what has come from an ESC; false where that is the loop's. */
+static kcg_input *input_at(kcg_turns *t, uint32_t place)
+{
+    int16_t number = t->ports.input_of[place];
+    return number < 0 ? NULL : &t->inputs[number];
+}
+
+/* Reads the bytes of an ESC. Returns 0 if the loop has to do it (twin: SerialPort.read). */
 static int fetch(kcg_turns *t, int fd, kcg_input *in)
 {
-    ssize_t size = has_room(t, KCG_READ) ? read(fd, t->data, KCG_READ) : 0;
+    kcg_turn_reads *r = &t->reads;
+    ssize_t size = has_room(t, KCG_READ) ? read(fd, r->data, KCG_READ) : 0;
     if (size <= 0)
         return 0;
     in->served = 1;
-    t->size = (uint32_t)size;
-    t->since = in->undrained_ns != KCG_DRAINED ? in->undrained_ns : in->asked_ns;
-    int64_t passed = t->since + size * KCG_BYTE_NS;
-    in->undrained_ns = passed < t->now ? passed : t->now; /* of what was left, if anything was: that is asked at the turn's end */
-    note(t, KCG_NOTE_BYTES, in->esc, t->data, t->size, t->since);
+    r->size = (uint32_t)size;
+    r->since = in->undrained_ns != KCG_DRAINED ? in->undrained_ns : in->asked_ns;
+    /* Bytes that this read left arrived after those that it returned. Whether it left any is polled
+       at the end of the turn. */
+    int64_t passed = r->since + size * KCG_BYTE_NS;
+    in->undrained_ns = passed < t->times.now ? passed : t->times.now;
+    note(t, KCG_NOTE_BYTES, in->esc, r->data, r->size, r->since);
     return 1;
 }
 
-/* Take what has come from the next ESC, or, after an event, what the core has not taken yet; false where that is the loop's. */
+/* Gives the core the bytes of the next ready port, or, after an event, those that it has not
+   processed. Returns 0 if the loop has to do it. */
 static int serve(kcg_turns *t)
 {
-    uint16_t place = t->place[t->at];
-    kcg_input *in = &t->inputs[t->input_of[place]];
-    if (!t->size && !fetch(t, t->fds[place].fd, in))
+    kcg_turn_reads *r = &t->reads;
+    uint16_t place = r->place[r->at];
+    kcg_input *in = input_at(t, place);
+    if (!r->size && !fetch(t, t->ports.fds[place].fd, in))
         return 0;
-    t->found = kcg_receive(t->core, in->esc, t->data, t->size, t->now, t->since);
-    if (t->found >= KCG_AGAIN)
-        t->found &= ~KCG_AGAIN;
-    else
-        t->size = 0, t->at++;
+    int event = kcg_receive(t->core, in->esc, r->data, r->size, t->times.now, r->since);
+    if (event >= KCG_AGAIN) {
+        event &= ~KCG_AGAIN;
+    } else {
+        r->size = 0;
+        r->at++;
+    }
+    t->result.event = event;
     return 1;
 }
 
-/* Hand the frames that wait to the bus, as far as it takes them: what sendmmsg answered last, below 0 with errno, or that they are old. */
+/* Gives `count` frames to the kernel. Returns the number that it took, or -1 with errno. */
+static int send_frames(int bus, kcg_frame *frame, uint32_t count)
+{
+    struct mmsghdr m[KCG_AT_ONCE];
+    struct iovec v[KCG_AT_ONCE];
+    uint8_t pages[KCG_AT_ONCE];
+    memset(m, 0, count * sizeof *m);
+    for (uint32_t i = 0; i < count; i++) {
+        pages[i] = frame[i].page;
+        frame[i].page = 0;
+        v[i].iov_base = &frame[i];
+        v[i].iov_len = frame[i].flags ? FD_SIZE : CLASSIC_SIZE;
+        m[i].msg_hdr.msg_iov = &v[i];
+        m[i].msg_hdr.msg_iovlen = 1;
+    }
+    int sent = sendmmsg(bus, m, count, MSG_DONTWAIT);
+    for (uint32_t i = 0; i < count; i++)
+        frame[i].page = pages[i];
+    return sent;
+}
+
+/* Sends waiting frames until the kernel refuses one, or until they are too old. Returns the last
+   result of send_frames, and errno is 0 if that was not negative. */
 static int hand_over(kcg_turns *t)
 {
-    struct mmsghdr m[AT_ONCE];
-    struct iovec v[AT_ONCE];
-    uint8_t pages[AT_ONCE];
+    kcg_turn_queue *q = &t->queue;
     uint32_t sent = 0;
-    int went = 0;
+    int result = 0;
     errno = 0;
-    while (sent < t->unsent && went >= 0) {
-        uint32_t n = t->unsent - sent < AT_ONCE ? t->unsent - sent : AT_ONCE;
-        if (now_ns() - t->now > t->max_turn) /* they have become old while they were made */
+    while (sent < q->count && result >= 0) {
+        uint32_t left = q->count - sent;
+        if (now_ns() - t->times.now > t->request.max_turn) /* too old: making them took long */
             break;
-        memset(m, 0, n * sizeof *m);
-        for (uint32_t i = 0; i < n; i++) {
-            kcg_frame *f = &t->frames[sent + i];
-            pages[i] = f->page, f->page = 0;
-            v[i].iov_base = f, v[i].iov_len = f->flags ? FD_SIZE : CLASSIC_SIZE;
-            m[i].msg_hdr.msg_iov = &v[i], m[i].msg_hdr.msg_iovlen = 1;
-        }
-        went = sendmmsg(t->bus, m, n, MSG_DONTWAIT);
-        for (uint32_t i = 0; i < n; i++)
-            t->frames[sent + i].page = pages[i];
-        sent += went > 0 ? (uint32_t)went : 0;
+        uint32_t part = left < KCG_AT_ONCE ? left : KCG_AT_ONCE;
+        result = send_frames(t->request.bus, q->frame + sent, part);
+        if (result > 0)
+            sent += (uint32_t)result;
     }
     t->core->gateway[KCG_SENT_FRAMES] += sent;
-    t->unsent -= sent;
-    t->spoken -= sent < t->spoken ? sent : t->spoken;
-    memmove(t->frames, t->frames + sent, t->unsent * sizeof *t->frames);
-    return went;
+    q->count -= sent;
+    q->from_outputs -= sent < q->from_outputs ? sent : q->from_outputs;
+    memmove(q->frame, q->frame + sent, q->count * sizeof *q->frame);
+    return result;
 }
 
-/* Be woken, or no longer, when the bus takes frames again. */
+/* Lets epoll report, or no longer report, that the bus takes frames again. */
 static void watch_room(kcg_turns *t, int is_full)
 {
-    struct epoll_event e = {.events = EPOLLIN | (is_full ? EPOLLOUT : 0u), .data.u32 = t->bus_place};
-    if (t->is_full != (uint32_t)is_full)
-        epoll_ctl(t->epoll, EPOLL_CTL_MOD, t->bus, &e);
-    t->is_full = (uint32_t)is_full;
+    struct epoll_event e = {.events = EPOLLIN, .data.u32 = t->ports.bus_place};
+    if (is_full)
+        e.events |= EPOLLOUT;
+    if (t->queue.is_full != (uint32_t)is_full)
+        epoll_ctl(t->ports.epoll, EPOLL_CTL_MOD, t->request.bus, &e);
+    t->queue.is_full = (uint32_t)is_full;
 }
 
-/* The place of what waits of an id and page; all that waits where there is none. */
-static uint32_t place_of(const kcg_turns *t, uint32_t id, uint32_t page)
+/* Returns the index of the waiting frame with this id and page, or q->count (twin:
+   TransmitQueue). Frames of outputs are left out. */
+static uint32_t waiting_at(const kcg_turn_queue *q, uint32_t id, uint32_t page)
 {
-    uint32_t i = t->spoken;
-    while (i < t->unsent && (t->frames[i].id != id || t->frames[i].page != page))
+    uint32_t i = q->from_outputs;
+    while (i < q->count && (q->frame[i].id != id || q->frame[i].page != page))
         i++;
     return i;
 }
 
-/* Whether an older transfer than this part's is on its way: its first frame is gone, others wait. It ends as it began. */
-static int has_begun(const kcg_turns *t, const kcg_frame *made)
+/* Returns 1 if an older transfer with this id was sent in part: its first frame has been sent, and
+   others wait. It must end as it began. */
+static int has_begun(const kcg_turn_queue *q, const kcg_frame *made)
 {
-    uint32_t first = made->page - (made->page - (uint32_t)KCG_FIRST_PART) % KCG_PARTS, waiting = 0;
-    if (made->page < KCG_FIRST_PART || place_of(t, made->id, first) < t->unsent)
+    uint32_t waiting = 0;
+    if (made->page < KCG_FIRST_PART)
+        return 0;
+    uint32_t first = made->page - (made->page - (uint32_t)KCG_FIRST_PART) % KCG_PARTS;
+    if (waiting_at(q, made->id, first) < q->count)
         return 0;
     for (uint32_t k = 1; k < KCG_PARTS; k++)
-        waiting += place_of(t, made->id, first + k) < t->unsent;
+        waiting += waiting_at(q, made->id, first + k) < q->count;
     return waiting > 0;
 }
 
-/* Let a frame wait: in the place of an older one of its id and page. */
+/* Lets a frame wait. It replaces an older frame with the same id and page (twin: TransmitQueue). */
 static void put(kcg_turns *t, const kcg_frame *made)
 {
-    uint32_t i = place_of(t, made->id, made->page);
-    int is_late = has_begun(t, made);
-    t->core->gateway[KCG_REPLACED_FRAMES] += is_late || i < t->unsent;
+    kcg_turn_queue *q = &t->queue;
+    uint32_t i = waiting_at(q, made->id, made->page);
+    int is_late = has_begun(q, made);
+    t->core->gateway[KCG_REPLACED_FRAMES] += is_late || i < q->count;
     if (is_late)
         return;
-    t->unsent += i == t->unsent;
-    t->frames[i] = *made;
+    q->count += i == q->count;
+    q->frame[i] = *made;
 }
 
-/* What is pending goes to the bus, or waits until it takes frames again; false where that is the loop's. */
+/* Moves the core's pending frames to the queue. `had_waiting`: frames waited before. */
+static void take_pending(kcg_turns *t, int had_waiting)
+{
+    kcg_turn_queue *q = &t->queue;
+    while (q->count <= KCG_OUT - KCG_MADE) {
+        uint32_t count = kcg_take(t->core, t->times.now, q->made, KCG_MADE);
+        if (!count)
+            return;
+        kcg_sent(t->core, t->times.now, count);
+        t->result.taken += count;
+        for (uint32_t i = 0; i < count; i++) {
+            if (had_waiting)
+                put(t, &q->made[i]);
+            else
+                q->frame[q->count++] = q->made[i];
+        }
+    }
+}
+
+/* Sends pending frames, or lets them wait for the bus. Returns 0 if the loop has to go on. */
 static int transmit(kcg_turns *t)
 {
+    kcg_turn_queue *q = &t->queue;
     do {
-        uint32_t count, before = t->unsent;
-        while (t->unsent <= KCG_OUT - KCG_MADE && (count = kcg_take(t->core, t->now, t->made, KCG_MADE))) {
-            kcg_sent(t->core, t->now, count);
-            t->taken += count;
-            for (uint32_t i = 0; i < count; i++) {
-                if (before)
-                    put(t, &t->made[i]);
-                else
-                    t->frames[t->unsent++] = t->made[i];
-            }
-        }
-        if (t->unsent && !t->is_full) {
-            uint32_t waiting = t->unsent;
-            int went = hand_over(t), is_full = went < 0 && errno == EAGAIN;
-            if (t->unsent < waiting || !before || !is_full)
-                t->full_since = t->now;
-            if (t->unsent && (!is_full || t->records || t->spoken))
+        uint32_t before = q->count;
+        take_pending(t, before > 0);
+        if (q->count && !q->is_full) {
+            uint32_t waiting = q->count;
+            int result = hand_over(t);
+            int is_full = result < 0 && errno == EAGAIN;
+            if (q->count < waiting || !before || !is_full)
+                q->full_since = t->times.now;
+            if (q->count && (!is_full || t->request.is_recorded || q->from_outputs))
                 return 0;
             t->core->gateway[KCG_SEND_FAILURES] += is_full;
             watch_room(t, is_full);
         }
-    } while (t->core->pendings && !t->unsent);
-    return !t->core->pendings && (!t->unsent || t->now - t->full_since < MAX_FULL);
+    } while (t->core->pendings && !q->count);
+    return !t->core->pendings && (!q->count || t->times.now - q->full_since < MAX_FULL);
 }
 
 int kcg_watch(kcg_turns *t)
 {
-    if (t->epoll >= 0)
-        close(t->epoll);
-    t->epoll = t->count ? epoll_create1(EPOLL_CLOEXEC) : -1;
-    for (uint32_t i = 0; i < t->count && t->epoll >= 0; i++) {
-        struct epoll_event e = {.events = (uint32_t)t->fds[i].events, .data.u32 = i};
-        if (epoll_ctl(t->epoll, EPOLL_CTL_ADD, t->fds[i].fd, &e) < 0)
-            close(t->epoll), t->epoll = -1;
+    kcg_turn_ports *p = &t->ports;
+    if (p->epoll >= 0)
+        close(p->epoll);
+    p->epoll = p->count ? epoll_create1(EPOLL_CLOEXEC) : -1;
+    for (uint32_t i = 0; i < p->count && p->epoll >= 0; i++) {
+        struct epoll_event e = {.events = (uint32_t)p->fds[i].events, .data.u32 = i};
+        if (epoll_ctl(p->epoll, EPOLL_CTL_ADD, p->fds[i].fd, &e) < 0) {
+            close(p->epoll);
+            p->epoll = -1;
+        }
     }
-    return t->epoll >= 0;
+    return p->epoll >= 0;
 }
 
-/* What poll has answered, asked at a time: of what is not ready everything comes after it; what is has come since it was asked before. */
+/* Notes the answer of a poll at the time `asked`. If nothing is ready, all later bytes arrive after
+   `asked`. If something is ready, it has arrived since the poll before. */
 static void note_answer(const struct pollfd *p, kcg_input *in, int64_t asked)
 {
-    if (!p->revents)
-        in->undrained_ns = KCG_DRAINED, in->asked_ns = asked;
-    else if (in->undrained_ns == KCG_DRAINED)
+    if (!p->revents) {
+        in->undrained_ns = KCG_DRAINED;
+        in->asked_ns = asked;
+    } else if (in->undrained_ns == KCG_DRAINED) {
         in->undrained_ns = in->asked_ns;
-}
-
-/* See to it that the ports still are as they were set: another program, as stty, can change them at any time. */
-static void hold_settings(kcg_turns *t)
-{
-    t->looked = t->asked;
-    for (uint32_t i = 0; i < t->count; i++) {
-        uint8_t found[KCG_SETTINGS] = {0};
-        kcg_input *in = t->input_of[i] < 0 ? NULL : &t->inputs[t->input_of[i]];
-        if (in && !ioctl(t->fds[i].fd, TCGETS, found) && memcmp(found, in->settings, sizeof found))
-            in->restored |= !ioctl(t->fds[i].fd, TCSETS, in->settings);
     }
 }
 
-/* Ask which of all descriptors are ready. */
+/* Restores the settings of ports if another program, for example stty, has changed them. */
+static void hold_settings(kcg_turns *t)
+{
+    t->times.settings_checked = t->times.polled;
+    for (uint32_t i = 0; i < t->ports.count; i++) {
+        uint8_t found[KCG_SETTINGS] = {0};
+        kcg_input *in = input_at(t, i);
+        int fd = t->ports.fds[i].fd;
+        if (in && !ioctl(fd, TCGETS, found) && memcmp(found, in->settings, sizeof found))
+            in->restored |= !ioctl(fd, TCSETS, in->settings);
+    }
+}
+
+/* Polls all descriptors. */
 static void ask_all(kcg_turns *t)
 {
-    if (!t->fds[t->bus_place].revents)
-        t->before = t->asked; /* what the bus has brought came since */
-    t->asked = now_ns();
-    t->happened = poll(t->fds, t->count, 0);
-    if (t->happened < 0)
-        for (uint32_t i = 0; i < t->count; i++)
-            t->fds[i].revents = POLLIN; /* not known: reading tells */
-    for (uint32_t i = 0; i < t->count; i++)
-        if (t->input_of[i] >= 0)
-            note_answer(&t->fds[i], &t->inputs[t->input_of[i]], t->asked);
-    if (t->asked - t->looked >= LOOK)
+    kcg_turn_ports *p = &t->ports;
+    kcg_turn_times *times = &t->times;
+    if (!p->fds[p->bus_place].revents)
+        times->bus_empty = times->polled;
+    times->polled = now_ns();
+    t->result.happened = poll(p->fds, p->count, 0);
+    if (t->result.happened < 0)
+        for (uint32_t i = 0; i < p->count; i++)
+            p->fds[i].revents = POLLIN; /* unknown: a read will show it */
+    for (uint32_t i = 0; i < p->count; i++) {
+        kcg_input *in = input_at(t, i);
+        if (in)
+            note_answer(&p->fds[i], in, times->polled);
+    }
+    if (times->polled - times->settings_checked >= CHECK_EACH)
         hold_settings(t);
 }
 
-/* Ask what the reads of this turn have left: what the kernel has further back it passes on when poll, not epoll, asks. */
+/* Polls the ports that were read in this turn, because a read may have left bytes. poll, unlike
+   epoll, makes the kernel pass on bytes that it still holds further back. */
 static void ask_read(kcg_turns *t)
 {
-    struct pollfd fds[AT_ONCE];
+    const kcg_turn_reads *r = &t->reads;
+    struct pollfd fds[KCG_AT_ONCE];
     int64_t now = now_ns();
-    for (uint32_t i = 0; i < t->ready; i++)
-        fds[i] = (struct pollfd){t->fds[t->place[i]].fd, POLLIN, 0};
-    if (t->ready && poll(fds, t->ready, 0) >= 0)
-        for (uint32_t i = 0; i < t->ready; i++)
-            note_answer(&fds[i], &t->inputs[t->input_of[t->place[i]]], now);
+    for (uint32_t i = 0; i < r->ready; i++)
+        fds[i] = (struct pollfd){t->ports.fds[r->place[i]].fd, POLLIN, 0};
+    if (r->ready && poll(fds, r->ready, 0) >= 0)
+        for (uint32_t i = 0; i < r->ready; i++)
+            note_answer(&fds[i], input_at(t, r->place[i]), now);
 }
 
-/* Wait for the next turn; false where it is the loop's. */
+static int64_t earlier(int64_t a, int64_t b)
+{
+    return a < b ? a : b;
+}
+
+/* Waits for the next turn and lists the ready ports. Returns 0 if the loop has to make it. */
 static int wait_for_turn(kcg_turns *t)
 {
-    struct epoll_event events[AT_ONCE];
-    int64_t due = kcg_next_deadline(t->core), wake = t->asked + t->period, begun = now_ns(), limit = MS * 3600000;
-    if (t->due < due)
-        due = t->due;
-    if (t->outputs_due < due)
-        due = t->outputs_due;
-    int64_t up = wake < due ? 0 : MS - 1; /* by which a wait is too long rather than too short: not where it is to ask all */
-    if (wake < due)
-        due = wake;
-    int64_t last = t->now, pause = due > begun ? due - begun : 0;
-    int ready = epoll_wait(t->epoll, events, AT_ONCE, (int)(((pause < limit ? pause : limit) + up) / MS));
-    t->now = now_ns();
-    t->late = t->now - last - pause;
-    t->ready = t->at = t->size = t->advanced = 0;
-    if (ready < 0 || t->late > t->max_late || t->now >= t->due)
+    const kcg_turn_request *request = &t->request;
+    kcg_turn_reads *r = &t->reads;
+    struct epoll_event events[KCG_AT_ONCE];
+    int64_t due = earlier(kcg_next_deadline(t->core), earlier(request->due, request->outputs_due));
+    int64_t poll_all = t->times.polled + request->period;
+    int64_t begun = now_ns();
+    int64_t round_up = poll_all < due ? 0 : MS - 1; /* a deadline must have passed after the wait */
+    due = earlier(due, poll_all);
+    int64_t last = t->times.now;
+    int64_t pause = due > begun ? due - begun : 0;
+    int timeout_ms = (int)((earlier(pause, HOUR) + round_up) / MS);
+    int ready = epoll_wait(t->ports.epoll, events, KCG_AT_ONCE, timeout_ms);
+    t->times.now = now_ns();
+    t->result.late = t->times.now - last - pause;
+    r->ready = r->at = r->size = r->has_advanced = 0;
+    if (ready < 0 || t->result.late > request->max_late || t->times.now >= request->due)
         return 0;
     for (int i = 0; i < ready; i++) {
         uint32_t place = events[i].data.u32;
-        if (place == t->bus_place && t->is_full && events[i].events == EPOLLOUT) {
+        if (place == t->ports.bus_place && t->queue.is_full && events[i].events == EPOLLOUT) {
             watch_room(t, 0);
             continue;
         }
-        if (t->input_of[place] < 0 || events[i].events != EPOLLIN || !t->inputs[t->input_of[place]].is_plain)
+        kcg_input *in = input_at(t, place);
+        if (!in || events[i].events != EPOLLIN || !in->is_plain)
             return 0;
-        t->place[t->ready++] = (uint16_t)place;
+        r->place[r->ready++] = (uint16_t)place;
     }
     return 1;
 }
 
-/* A turn, or the rest of one after an event: until there is one (`found`), or to its end; false where something is left of it. */
+/* Returns 1 if nothing has arrived and nothing is due. */
+static int is_idle(const kcg_turns *t)
+{
+    int64_t due = earlier(kcg_next_deadline(t->core), t->request.outputs_due);
+    int may_send = t->queue.count && !t->queue.is_full;
+    return !t->reads.ready && t->times.now < due && !may_send;
+}
+
+/* Makes a turn, or the rest of one after an event. It ends early if there is a further event
+   (result.event). Returns 0 if the loop has to do the rest. */
 static int turn(kcg_turns *t)
 {
-    if (t->found >= 0)
-        t->found = kcg_next_event(t->core);
-    while (t->at < t->ready && t->found < 0)
+    kcg_turn_reads *r = &t->reads;
+    int32_t *event = &t->result.event;
+    if (*event >= 0)
+        *event = kcg_next_event(t->core);
+    while (r->at < r->ready && *event < 0)
         if (!serve(t))
             return 0;
-    if (t->found < 0 && !t->advanced) {
-        if (!t->ready && t->now < kcg_next_deadline(t->core) && t->now < t->outputs_due && (!t->unsent || t->is_full))
-            return !t->unsent || t->now - t->full_since < MAX_FULL; /* nothing has come, nothing is due */
+    if (*event < 0 && !r->has_advanced) {
+        if (is_idle(t))
+            return !t->queue.count || t->times.now - t->queue.full_since < MAX_FULL;
         note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);
-        t->found = kcg_advance(t->core, t->now);
-        t->advanced = 1;
+        *event = kcg_advance(t->core, t->times.now);
+        r->has_advanced = 1;
     }
-    if (t->found < 0 && t->now >= t->outputs_due)
-        t->found = KCG_OUTPUTS;
-    return t->found >= 0 || transmit(t);
+    if (*event < 0 && t->times.now >= t->request.outputs_due)
+        *event = KCG_OUTPUTS;
+    return *event >= 0 || transmit(t);
 }
 
 void kcg_begin(kcg_turns *t)
 {
-    t->found = -1;
-    t->unsent = t->spoken = t->taken = t->recorded = t->turns = t->is_over = 0;
-    for (uint32_t i = 0; i < t->count; i++)
-        if (t->fds[i].fd == t->bus) {
-            t->bus_place = i, t->fds[i].revents = 0;
-        } else if (t->input_of[i] >= 0) {
-            kcg_input *in = &t->inputs[t->input_of[i]];
-            in->asked_ns = in->empty_ns > t->asked ? in->empty_ns : t->asked;
+    kcg_turn_ports *p = &t->ports;
+    t->result.event = -1;
+    t->result.turns = t->result.taken = t->result.recorded = t->result.is_over = 0;
+    t->queue.count = t->queue.from_outputs = 0;
+    for (uint32_t i = 0; i < p->count; i++) {
+        kcg_input *in = input_at(t, i);
+        if (p->fds[i].fd == t->request.bus) {
+            p->bus_place = i;
+            p->fds[i].revents = 0;
+        } else if (in) {
+            in->asked_ns = in->empty_ns > t->times.polled ? in->empty_ns : t->times.polled;
         }
+    }
 }
 
 int kcg_turn(kcg_turns *t)
 {
-    while (t->found >= 0 || wait_for_turn(t)) {
+    int64_t poll_all_after = earlier(t->request.period - MS, MAX_UNPOLLED);
+    while (t->result.event >= 0 || wait_for_turn(t)) {
         int is_done = turn(t);
-        if (t->found >= 0)
+        if (t->result.event >= 0)
             return 1;
-        t->turns++;
-        if (!is_done || t->now >= t->leave || !has_room(t, KCG_RING / 2)) {
-            t->late = 0;
-            t->is_over = is_done && !t->unsent;
+        t->result.turns++;
+        if (!is_done || t->times.now >= t->request.leave || !has_room(t, KCG_RING / 2)) {
+            t->result.late = 0;
+            t->result.is_over = is_done && !t->queue.count;
             break;
         }
-        if (t->now - t->asked >= (t->period - MS < ASK_ALL ? t->period - MS : ASK_ALL))
+        if (t->times.now - t->times.polled >= poll_all_after)
             ask_all(t);
         else
             ask_read(t);
@@ -327,10 +416,12 @@ int kcg_turn(kcg_turns *t)
 void kcg_leave(kcg_turns *t)
 {
     watch_room(t, 0);
-    if (t->found >= 0)
-        t->turns++, t->late = 0;
+    if (t->result.event >= 0) {
+        t->result.turns++;
+        t->result.late = 0;
+    }
     ask_all(t);
-    t->late += t->asked - t->now;
+    t->result.late += t->times.polled - t->times.now;
 }
 
 uint32_t kcg_turns_size(void)

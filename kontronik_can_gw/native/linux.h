@@ -1,55 +1,123 @@
-/* Whole turns of the gateway's loop (linux.c). */
+/* Whole turns of the gateway's loop in C, on Linux (linux.c). The owner is native/turns.py. */
 #ifndef KCG_LINUX_H
 #define KCG_LINUX_H
 #include <poll.h>
 
 #include "core.h"
 
-enum { KCG_OUT = 512, KCG_MADE = 256, KCG_READ = 4096, KCG_RING = 1 << 18, KCG_FDS = 1024, KCG_AT_ONCE = 64, KCG_SETTINGS = 64 };
-enum { KCG_NOTE_BYTES = 1, KCG_NOTE_ADVANCE = 3 };     /* kinds of entries of a capture */
+enum {
+    KCG_OUT = 512,      /* Frames that can wait for the bus. */
+    KCG_MADE = 256,     /* Frames that are taken from the core at once. */
+    KCG_READ = 4096,    /* Bytes of one read. */
+    KCG_RING = 1 << 18, /* Bytes that can be recorded in one run. */
+    KCG_FDS = 1024,     /* Descriptors that are watched. */
+    KCG_AT_ONCE = 64,   /* Ports served in one turn; frames given to the kernel in one call. */
+    KCG_SETTINGS = 64   /* Bytes of a copy of struct termios. */
+};
+enum { KCG_NOTE_BYTES = 1, KCG_NOTE_ADVANCE = 3 }; /* Kinds of entries (capture/format.py, Kind). */
 
-#define KCG_OUTPUTS (1 << 29)          /* found: time is to pass for the outputs */
-#define KCG_DRAINED (INT64_C(1) << 62) /* output.NEVER */
+#define KCG_OUTPUTS (1 << 29)          /* An event: let time pass for the outputs. */
+#define KCG_DRAINED (INT64_C(1) << 62) /* As NEVER in times.py. */
 
-typedef struct {        /* of an ESC's port: as poller.PortInput */
-    int64_t empty_ns;     /* nothing had come by then */
-    int64_t asked_ns;     /* nothing had come by then, either: asked last */
-    int64_t undrained_ns; /* the last read left something, which came after this; KCG_DRAINED: it left nothing */
-    uint8_t is_plain, served, esc, restored, reserved[4]; /* restored: another program had changed the settings */
-    uint8_t settings[KCG_SETTINGS]; /* struct termios, as the port was set, and zeros */
+/* The port of an ESC (twin: poller.PortInput, which describes the fields of the same name). */
+typedef struct {
+    int64_t empty_ns;     /* The port was empty at this time. */
+    int64_t asked_ns;     /* The port was empty at this time, too: the last poll. */
+    int64_t undrained_ns; /* The last read left bytes that arrived after this; or KCG_DRAINED. */
+    uint8_t is_plain, served, esc;
+    uint8_t restored;     /* Another program had changed the settings, and they were set again. */
+    uint8_t reserved[4];
+    uint8_t settings[KCG_SETTINGS]; /* struct termios as the port was set, then zeros. */
 } kcg_input;
 
-typedef struct { int64_t now, came; uint32_t size; uint8_t kind, esc, reserved[2]; } kcg_entry; /* then the data, to a multiple of 8 */
+/* A recorded call of the core. The data follow, filled up to a multiple of 8 bytes. */
+typedef struct { int64_t now, came; uint32_t size; uint8_t kind, esc, reserved[2]; } kcg_entry;
+
+/* The owner's request. It is written before kcg_begin, and its deadlines also after an event. All
+   times are in ns. */
+typedef struct {
+    int64_t due;          /* Next deadline of the loop: return at this time. */
+    int64_t outputs_due;  /* Next deadline of the outputs: return KCG_OUTPUTS at this time. */
+    int64_t leave;        /* Return after the first turn at this time or later. */
+    int64_t period;       /* Longest time between two polls of all descriptors. */
+    int64_t max_late;     /* Return if a turn is later than this: the process was held up. */
+    int64_t max_turn;     /* Do not send frames whose turn has lasted longer than this. */
+    int32_t bus;          /* Socket of the CAN interface. */
+    uint32_t is_recorded; /* 1: record each call of the core in `ring`. */
+} kcg_turn_request;
+
+/* Times in ns. The owner writes the first three before kcg_begin and reads them after a run. */
+typedef struct {
+    int64_t now;              /* Time of the current turn, or of the last one. */
+    int64_t polled;           /* Last poll of all descriptors. */
+    int64_t bus_empty;        /* Last poll at which the bus had nothing to be read. */
+    int64_t settings_checked; /* Last check of the ports' settings. */
+} kcg_turn_times;
+
+/* The result of a run. */
+typedef struct {
+    int64_t late;      /* Time of the last turn and its wait beyond the planned pause, in ns. */
+    int32_t event;     /* An event of the core, or KCG_OUTPUTS; less than 0: none. */
+    int32_t happened;  /* Result of the last poll: the number of `fds` that are ready. */
+    uint32_t turns;    /* Turns since kcg_begin. */
+    uint32_t taken;    /* Frames that the core and the outputs made since kcg_begin. */
+    uint32_t recorded; /* Bytes in `ring`. */
+    uint32_t is_over;  /* 1: the last turn is complete. */
+} kcg_turn_result;
+
+/* The reads of the current turn. */
+typedef struct {
+    int64_t since;               /* The bytes in `data` arrived after this time. */
+    uint32_t ready, at;          /* Number of ports that are ready; how many of them were served. */
+    uint32_t size;               /* Bytes in `data` that the core has not processed. */
+    uint32_t has_advanced;       /* 1: kcg_advance was called. */
+    uint16_t place[KCG_AT_ONCE]; /* Indices of the ready ports in `fds`. */
+    uint8_t data[KCG_READ];
+} kcg_turn_reads;
+
+/* Frames that wait for the bus (twin: gateway/transmit_queue.py). */
+typedef struct {
+    int64_t full_since;    /* The bus has taken no frame since this time, in ns. */
+    uint32_t count;        /* Frames that wait. */
+    uint32_t from_outputs; /* The first of them are frames of outputs. They are never replaced. */
+    uint32_t is_full;      /* 1: the kernel refused a frame; epoll reports when there is room. */
+    kcg_frame frame[KCG_OUT];
+    kcg_frame made[KCG_MADE]; /* Frames that were just taken from the core. */
+} kcg_turn_queue;
+
+/* The descriptors that are watched. */
+typedef struct {
+    int32_t epoll;
+    uint32_t count, bus_place;  /* bus_place: index of the bus in `fds`. */
+    struct pollfd fds[KCG_FDS];
+    int16_t input_of[KCG_FDS];  /* Index in kcg_turns.inputs, or -1 if it is not an ESC's port. */
+} kcg_turn_ports;
 
 typedef struct {
     kcg *core;
-    kcg_input *inputs;
-    int64_t now, asked, before, late;    /* the last turn; when was asked what is ready, and the time before; how late that was */
-    int64_t due, outputs_due;            /* deadlines: of the loop, of the outputs */
-    int64_t leave, period, max_late, max_turn; /* when to come back; how often all are to be asked; limits of lateness */
-    int64_t full_since;                  /* the bus takes nothing */
-    int64_t since;                       /* nothing of `data` had come by then */
-    int64_t looked;                      /* when the ports' settings were looked at */
-    int32_t epoll, bus, found;           /* descriptors; an event to be followed, or KCG_OUTPUTS; below 0: none */
-    int32_t happened;                    /* how many of `fds` are ready */
-    uint32_t count, ready, unsent, taken, turns, records, recorded, bus_place, is_full;
-    uint32_t spoken;                     /* of `unsent`, the first: frames of outputs, in their order, never replaced */
-    uint32_t is_over;                    /* nothing is left of the last turn */
-    uint32_t at, size, advanced;         /* of this turn: the next of `ready`; bytes in `data` that the core is to be given; time has passed */
-    struct pollfd fds[KCG_FDS];
-    int16_t input_of[KCG_FDS];            /* place in `inputs`, -1: none of an ESC */
-    uint16_t place[KCG_AT_ONCE];         /* in `fds`, of the `ready` ports of this turn */
-    kcg_frame frames[KCG_OUT], made[KCG_MADE]; /* those that wait; those of this turn */
-    uint8_t data[KCG_READ], ring[KCG_RING];
+    kcg_input *inputs; /* One for each ESC. */
+    kcg_turn_request request;
+    kcg_turn_times times;
+    kcg_turn_result result;
+    kcg_turn_reads reads;
+    kcg_turn_queue queue;
+    kcg_turn_ports ports;
+    uint8_t ring[KCG_RING]; /* Recorded calls: kcg_entry and data, one after the other. */
 } kcg_turns;
 
-/* `fds` are others: wait for these. 0 where that cannot be. */
+/* Watches the descriptors in `ports.fds`. Call it after changing them. Returns 0 if that is
+   impossible. */
 int kcg_watch(kcg_turns *t);
+/* Starts a run. Call it before the first kcg_turn. */
 void kcg_begin(kcg_turns *t);
-/* Turn until there is something for the loop: 0, and `fds` says what is ready; or until `found` is an event to be followed: 1. Then it is called
-   again (and asks kcg_next_event), with the frames that the outputs have made of it in `frames`, or kcg_leave: the rest of the turn is the loop's.
-   After KCG_OUTPUTS `outputs_due` is another one. */
+/* Makes turns until the loop has something to do.
+   Returns 0 if the loop has to make the next turn: `ports.fds` shows which descriptors are ready.
+   Returns 1 if the owner has to follow `result.event`. Then it calls kcg_turn again, after it has
+   put the frames that outputs made of the event into `queue`. Or it calls kcg_leave: then the loop
+   makes the rest of the turn. After KCG_OUTPUTS the owner must have changed request.outputs_due. */
 int kcg_turn(kcg_turns *t);
+/* Ends a run after an event. */
 void kcg_leave(kcg_turns *t);
+/* Returns the size of kcg_turns. */
 uint32_t kcg_turns_size(void);
 #endif

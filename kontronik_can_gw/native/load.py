@@ -1,4 +1,4 @@
-"""Which core runs: the one in C where its shared object is there and can express the layout; else the one in Python, and why."""
+"""Selects the core: in C if its shared object fits and can express the layout, else in Python."""
 
 import os
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ PURE = "KONTRONIK_PURE"
 
 
 class Made(NamedTuple):
-    """A core, and in words why it is the one in Python; empty with the one in C."""
+    """A core. ``why`` explains why it is the core in Python, and is "" for the core in C."""
 
     core: Core
     why: str
@@ -24,14 +24,14 @@ class Made(NamedTuple):
 
 @cache
 def library() -> tuple[Any, str]:
-    """The shared object; None where it cannot or is not to be used, and why."""
+    """Return the shared object and "". If it is not used, return None and the reason."""
     if os.environ.get(PURE, "0") not in ("", "0"):
         return None, f"{PURE} is set"
     path = shared_object()
     if why := fault(path):
         return None, why
     try:
-        # where memory must not be executed, ctypes itself may not load
+        # ctypes cannot be imported if the system forbids memory to be executed
         from kontronik_can_gw.native.binding import WrongObject, load
     except (ImportError, MemoryError, OSError) as error:
         return None, f"ctypes cannot be used here: {error}"
@@ -48,7 +48,10 @@ def make_core(
     silent: bool,
     slots: int = 0,
 ) -> Made:
-    """The core for these ESCs and this layout. ``slots`` of each ESC have room in C."""
+    """Return the core for these ESCs and this layout.
+
+    ``slots`` is the number of slots of each ESC for which the core in C has room.
+    """
     found, why = library()
     if found is not None:
         from kontronik_can_gw.native.core import NativeCore
@@ -62,7 +65,10 @@ def make_core(
 
 
 def give_back() -> None:
-    """Give the system the memory that the C library holds free. Nothing without the core in C, or where the library cannot (musl)."""
+    """Return free memory of the C library to the system.
+
+    Does nothing without the core in C, or if the C library has no such function (musl).
+    """
     if library()[0] is None:
         return
     import ctypes
@@ -73,5 +79,5 @@ def give_back() -> None:
 
 
 def in_words(language: str, why: str | None) -> str:
-    """One line for people, as ``core: Python (KONTRONIK_PURE is set)``."""
+    """Return a line for people, for example ``core: Python (KONTRONIK_PURE is set)``."""
     return f"core: {language} ({why})" if why else f"core: {language}"

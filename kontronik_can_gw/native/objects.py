@@ -1,6 +1,6 @@
-"""The shared objects of the core in C beside its sources: which one is this process's, and whether it may be loaded at all.
+"""The shared objects of the core in C, which are stored next to its sources.
 
-A file that was cut off or damaged would end the process when it is loaded, so it is looked at before.
+A truncated or damaged object would end the process that loads it, so it is checked before.
 """
 
 import os
@@ -8,18 +8,23 @@ import sys
 import zlib
 from pathlib import Path
 
+from kontronik_can_gw.esc.kontronik.c_header import wire_header as wire_header
+
 FOLDER = Path(__file__).parent
 NOT_BUILT = FOLDER / "not_built.txt"
-"""Why the installation made no object; hatch_build.py writes it."""
+"""The reason why the installation made no object. hatch_build.py writes it."""
 OPTIONS = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_SLOTS=1", "-DKCG_FOUND=512", "-DKCG_SLICES=8")
-"""What the objects are built with: CAN FD, floats and slots, for reads of 16 KiB."""
+"""Options of the compiler: CAN FD, floats and slots, for reads of 16 KiB."""
 _SEALED = 0x2144_DF1C
-"""CRC-32 of anything that its own CRC-32 follows."""
+"""The CRC-32 of any data followed by their own CRC-32."""
 _IN_32_BITS = {"x86_64": "i686", "aarch64": "armv7l", "armv8l": "armv7l"}
 
 
 def shared_object(machine: str = "") -> Path:
-    """Where the one for a machine is, or would be; as a rule for this process, which may have 32 bits on a machine that has 64."""
+    """Return the path of the object for a machine, whether it exists or not.
+
+    Without ``machine``, it is the path for this process, which can have 32 bits on a 64-bit machine.
+    """
     if not machine:
         machine = os.uname().machine
         if sys.maxsize < 1 << 32:
@@ -28,25 +33,25 @@ def shared_object(machine: str = "") -> Path:
 
 
 def sources() -> list[Path]:
-    """All C files of the core, headers too."""
+    """Return all C files and headers of the core except the generated wire.h."""
     return sorted(FOLDER.glob("*.[ch]"))
 
 
 def source_number() -> int:
-    """A number of sources and options, which an object made of them carries."""
-    found = zlib.crc32(" ".join(OPTIONS).encode())
+    """Return a number of sources, wire.h and options, which an object made of them carries."""
+    found = zlib.crc32(" ".join((*OPTIONS, wire_header())).encode())
     for source in sources():
         found = zlib.crc32(source.read_bytes(), found)
     return found & 0x7FFF_FFFF
 
 
 def sealed(content: bytes) -> bytes:
-    """An object with its CRC-32 at the end, where no loader looks."""
+    """Return an object with its CRC-32 at the end, which loaders ignore."""
     return content + zlib.crc32(content).to_bytes(4, "little")
 
 
 def fault(path: Path) -> str:
-    """Why an object cannot be loaded, in one line; empty where it may be tried."""
+    """Return in one line why an object cannot be loaded, or "" if it can be tried."""
     try:
         content = path.read_bytes()
         if zlib.crc32(content) != _SEALED:
@@ -71,5 +76,5 @@ def _not_built() -> str:
 
 
 def _machine(content: bytes) -> bytes:
-    """Word length, byte order and e_machine of an ELF header."""
+    """Return word length, byte order and e_machine of an ELF header."""
     return content[4:6] + content[18:20]

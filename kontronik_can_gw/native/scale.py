@@ -13,9 +13,15 @@ from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import MAX_GEAR, MAX_POLES, NotInCore
 from kontronik_can_gw.signals.plan import SignalPlan
 
-_TYPE_RANGES = ((0, 0xFF), (-0x80, 0x7F), (0, 0xFFFF), (-0x8000, 0x7FFF), (0, 0xFFFF_FFFF))
+_TYPE_RANGES = {
+    KCG.U8: (0, 0xFF),
+    KCG.I8: (-0x80, 0x7F),
+    KCG.U16: (0, 0xFFFF),
+    KCG.I16: (-0x8000, 0x7FFF),
+    KCG.U32: (0, 0xFFFF_FFFF),
+}
 MAX_COUNT = 1 << 48
-"""Of a counter or an integral: at 1 Mbit/s more than a human life."""
+"""Limit of a counter or an integral. At 1 Mbit/s it is reached after more than a human life."""
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
     Divisor.POLE_PAIRS: (MAX_POLES, 1),
@@ -23,7 +29,7 @@ _LARGEST_DIVISOR = {
     Divisor.CELLS: (255, 1),
 }
 END_OF_TIME = 1 << 61
-"""ns: sums of times stay within int64."""
+"""Limit of times in ns. Sums of times stay within int64."""
 _LIMIT = 1 << 63
 _MAX_DIGITS = 15
 """Digits that a factor of a DBC has at most."""
@@ -55,13 +61,13 @@ def set_scale(row: Any, signal: SignalPlan, value: Value) -> None:
 
 
 def _reduced(mul: int, add: int, div: int) -> tuple[int, int, int]:
-    """The same quotient with smaller numbers: floor((x * mul + add) / div)."""
+    """Return smaller numbers for the same quotient floor((x * mul + add) / div)."""
     by = math.gcd(mul, add, div)
     return mul // by, add // by, div // by
 
 
 def _range(row: Any, value: Value) -> tuple[int, int]:
-    """Of the steps, before any divisor."""
+    """Return the smallest and the greatest number of steps, before they are divided."""
     if row.kind in (KCG.OF_LIVE, KCG.OF_INFO, KCG.OF_LAST):
         return _TYPE_RANGES[row.wire]
     if row.kind == KCG.OF_DIRECTED:
@@ -70,7 +76,9 @@ def _range(row: Any, value: Value) -> tuple[int, int]:
     low = 0 if value.low is None else value.low
     if value.high is not None:
         return low, value.high
-    return low, END_OF_TIME if value.kind is Kind.RUN_TIME else MAX_COUNT  # ns; mW s, ms, frames
+    if value.kind is Kind.RUN_TIME:
+        return low, END_OF_TIME  # in ns
+    return low, MAX_COUNT  # in mW s, ms or frames
 
 
 def _set_integer_scale(row: Any, signal: SignalPlan, value: Value) -> None:
@@ -81,34 +89,42 @@ def _set_integer_scale(row: Any, signal: SignalPlan, value: Value) -> None:
     if signal.numbers is not None:
         return
     common = signal.slope.denominator * signal.intercept.denominator
-    mul, add = 2 * int(signal.slope * common), 2 * int(signal.intercept * common) + common
+    mul = 2 * int(signal.slope * common)
+    add = 2 * int(signal.intercept * common) + common  # plus one half: halves are rounded up
     mul, add, div = _reduced(mul, add, 2 * common)
     most = _most(row, signal, value, (mul, add, div))
     by, over = _LARGEST_DIVISOR[value.divisor]
     greatest = most * abs(mul) * over + abs(add) * by
     if greatest >= _LIMIT or div * by >= _LIMIT:
         raise NotInCore(f"factor {_decimal(signal.factor)} leaves 64 bits")
-    row.mul, row.add, row.div, row.most = mul, add, div, most
+    row.mul = mul
+    row.add = add
+    row.div = div
+    row.most = most
 
 
 def _most(row: Any, signal: SignalPlan, value: Value, scale: tuple[int, int, int]) -> int:
-    """The largest absolute number of steps that the core has to multiply.
+    """Return the largest absolute number of steps that the core has to multiply.
 
-    Beyond it, in either direction, the signal cannot hold the value whatever its divisor is, and is Error. A counter that rolls over
-    is never too large.
+    Beyond it, in either direction, the signal cannot hold the value, whatever the divisor is, and
+    is Error. A counter that rolls over is never too large.
     """
     greatest = max(map(abs, _range(row, value)))
     mul, add, div = scale
     if value.rolls or not mul:
         return greatest
     by, _ = _LARGEST_DIVISOR[value.divisor]
-    above, below = (signal.high + 1) * div - add, add - signal.low * div
-    return min(greatest, by * max(0, above, below) // abs(mul) + 1)
+    above = (signal.high + 1) * div - add
+    below = add - signal.low * div
+    first_too_large = by * max(0, above, below) // abs(mul) + 1
+    return min(greatest, first_too_large)
 
 
 def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
     """Factor, offset and limits of a float signal. NotInCore if a product leaves 63 bits."""
-    row.low, row.high = (struct.unpack("<q", struct.pack("<d", end))[0] for end in signal.limits)
+    low, high = signal.limits
+    row.low = _bits_of(low)
+    row.high = _bits_of(high)
     by, over = _LARGEST_DIVISOR[value.divisor]
     mul, div = signal.slope.numerator, signal.slope.denominator
     greatest = max(map(abs, _range(row, value))) * abs(mul) * over
@@ -116,15 +132,24 @@ def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
         raise NotInCore(f"factor {_decimal(signal.factor)} leaves 63 bits")
     if signal.numbers is None:
         row.mul, row.div = mul, div
-    row.add = struct.unpack("<q", struct.pack("<d", float(signal.intercept)))[0]
+    row.add = _bits_of(float(signal.intercept))
     if signal.intercept == 0:
         row.flags |= KCG.PLAIN
+
+
+def _bits_of(number: float) -> int:
+    """Return the bits of a double as a signed integer."""
+    (bits,) = struct.unpack("<q", struct.pack("<d", number))
+    return int(bits)
 
 
 def _fitting_factor(
     row: Any, signal: SignalPlan, value: Value, set_one: Callable[..., None]
 ) -> str:
-    """A hint that names a factor which the core can express: with fewer digits, else a coarser or finer one; "" if there is none."""
+    """Return a hint with a factor that the core can express, or "".
+
+    It has fewer digits. If no such factor fits, it is a coarser or a finer power of ten.
+    """
     rounded = [f"{float(signal.factor):.{digits}g}" for digits in range(_MAX_DIGITS, 0, -1)]
     first = Fraction(rounded[-1])
     coarser = [first * 10**power for power in range(1, _MAX_POWER)]
@@ -148,5 +173,5 @@ def _fitting_factor(
 
 
 def _decimal(number: Fraction) -> str:
-    """A factor as a DBC writes it."""
+    """Return a factor as it is written in a DBC."""
     return f"{float(number):.{_MAX_DIGITS}g}"

@@ -1,4 +1,4 @@
-"""Slots of the core in C (core.h, kcg_slot_start ...): their rows in its tables, and each as its owner sees it."""
+"""Slots of the core in C (core.h, kcg_slot_start): their rows in its tables, and their interface."""
 
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
@@ -7,20 +7,20 @@ from kontronik_can_gw.core.slots import PythonSlot, SlotPlan, SlotSettings
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.native.header import KCG
-from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal
+from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal, SlotRow
 from kontronik_can_gw.native.tables import MAX_ROWS, Tables
 from kontronik_can_gw.signals.plan import Layout
 
 MAX_SIGNALS = 8
-"""Of a slot."""
+"""Number of signals of a slot."""
 _MAX_PLANS = 256
-"""Kept."""
+"""Number of plans whose rows are kept."""
 _MAX_IN_ONE_FRAME = 7
-"""Bytes of a transfer of one frame."""
+"""Largest transfer in bytes that one frame can hold."""
 
 
 class Place(NamedTuple):
-    """Where a slot's rows are: its number, its message, its first signal and piece."""
+    """The number of a slot, and the indices of its message, first signal and first piece."""
 
     number: int
     message: int
@@ -29,7 +29,10 @@ class Place(NamedTuple):
 
 
 def reserve(tables: Tables, slots: int) -> list[list[Place]]:
-    """Add empty rows for ``slots`` of each ESC, or as many as there is room for. Returns the places of each ESC."""
+    """Add empty rows for ``slots`` slots of each ESC, or for as many as there is room.
+
+    Return the places of each ESC.
+    """
     count = len(tables.listeners_of)
     used = max(len(tables.signals), len(tables.messages), len(tables.listeners), tables.pages)
     slots = min(slots, (MAX_ROWS - used) // (MAX_SIGNALS * count))
@@ -41,7 +44,7 @@ def reserve(tables: Tables, slots: int) -> list[list[Place]]:
 
 def _add(tables: Tables, esc: int) -> Place:
     signal, piece = len(tables.signals), len(tables.pieces)
-    place = Place(len(tables.watched), len(tables.messages), signal, piece)
+    place = Place(len(tables.slots), len(tables.messages), signal, piece)
     tables.messages.append(
         Message(
             words=1,
@@ -59,12 +62,12 @@ def _add(tables: Tables, esc: int) -> Place:
     tables.constants += [0, 0]
     tables.pages += 1
     tables.esc_of.append(esc)
-    tables.watched.append(0)
+    tables.slots.append(SlotRow())
     return place
 
 
 def frame_count(message: Any) -> int:
-    """Return the number of frames of a row of kcg_message."""
+    """Return the number of frames of a row of kcg_message (twin: core.c, parts_of)."""
     is_long = message.flags & KCG.TRANSFER and message.length > _MAX_IN_ONE_FRAME
     return (int(message.length) + 8) // 7 if is_long else 1
 
@@ -87,8 +90,6 @@ def write_message(message: Any, settings: SlotSettings, signals: int) -> None:
     message.id = settings.can_id | (EXTENDED if is_transfer else 0)
     message.length = plan.message.length
     message.words = 2 if plan.message.length > 8 else 1
-    message.crc_at = settings.page
-    message.data_id = plan.seed or 0
     flags = KCG.EVENT * settings.by_event | KCG.SILENT * plan.needs_live
     message.flags = flags | KCG.TRANSFER * is_transfer | KCG.PACED * plan.paced
     message.triggers = plan.triggers
@@ -112,7 +113,7 @@ class SlotHost(Protocol):
 
 
 class NativeSlot:
-    """A slot (``core.slots.Slot``) that C sends, or ``python`` if C cannot express it.
+    """A Slot that runs in C if the core has all of its values. Otherwise ``python`` runs it.
 
     ``place`` is None if C has no room for it.
     """

@@ -1,4 +1,4 @@
-"""What others read of the core in C: the state of an ESC and of the gateway, straight from its memory."""
+"""The state of an ESC and of the gateway, read from the memory of the core in C."""
 
 import ctypes as c
 import struct
@@ -13,20 +13,27 @@ from kontronik_can_gw.native.rows import COUNTS, GATEWAY
 from kontronik_can_gw.status import CanState, GatewayState
 
 _STREAM = COUNTS.index("longer_crcs") + 1
-"""Number of counters in kcg_esc.count that are those of the stream."""
-_PLACES = (("has_live", "live"), ("has_info", "info"), ("had_live", "live"), ("had_info", "info"))
-"""Of live data, info, and the newest ever of both: whether there is any, and its bytes."""
+"""Number of entries in kcg_esc.count that count the stream. They are at the beginning."""
+_LIVE, _INFO, _LAST_LIVE, _LAST_INFO = range(4)
+"""Kinds of readings: fresh live data and info data, and the newest ones, fresh or not."""
+_FIELDS = {
+    _LIVE: ("has_live", "live"),
+    _INFO: ("has_info", "info"),
+    _LAST_LIVE: ("had_live", "live"),
+    _LAST_INFO: ("had_info", "info"),
+}
+"""Fields of kcg_esc for each kind: whether there are data, and their bytes."""
 
 
 @cache
 def _forms(protocol: EscProtocol) -> Sequence[tuple[struct.Struct, Any]]:
-    """Of live data and info, for all ESCs of a protocol."""
+    """Return how to unpack live data and info data, and their types."""
     assert protocol.wire is not None
     return [(struct.Struct("<" + codes), kind) for codes, kind in protocol.wire]
 
 
 class NativeEsc(EscTelemetry):
-    """The state of an ESC. What the core holds is read when somebody asks."""
+    """The state of an ESC. Values in the core's memory are read on demand."""
 
     def __init__(self, settings: EscSettings, state: Any) -> None:
         self._state = state
@@ -51,31 +58,33 @@ class NativeEsc(EscTelemetry):
 
     @property
     def counters(self) -> Counters:
-        found: Counters = self._counters_of(*self._state.count[:_STREAM])
+        counts = self._state.count[:_STREAM]
+        found: Counters = self._counters_of(*counts)
         return found
 
-    def reading(self, place: int) -> Data | None:
-        """Live data, info, and the newest ever of both; None where there is none."""
+    def reading(self, kind: int) -> Data | None:
+        """Return the data of a kind of readings, or None if there are none."""
         state, known = self._state, self._readings
         if state.generation != self._generation:
             self._generation = state.generation
             known.clear()
-        elif place in known:
-            return known[place]
-        there, body = _PLACES[place]
-        known[place] = None
-        if getattr(state, there):
-            form, kind = self._forms[place & 1]
-            known[place] = tuple.__new__(kind, form.unpack_from(getattr(state, body)))
-        return known[place]
+        elif kind in known:
+            return known[kind]
+        has_data, body = _FIELDS[kind]
+        known[kind] = None
+        if getattr(state, has_data):
+            form, data_type = self._forms[kind & 1]
+            fields = form.unpack_from(getattr(state, body))
+            known[kind] = tuple.__new__(data_type, fields)
+        return known[kind]
 
 
 _READ: dict[str, Callable[[NativeEsc], Any]] = {
-    "live": lambda esc: esc.reading(0),
-    "info": lambda esc: esc.reading(1),
-    "last_live": lambda esc: esc.reading(2),
-    "last_info": lambda esc: esc.reading(3),
-    "device": lambda esc: esc.protocol.value("device_raw", esc.reading(3)),
+    "live": lambda esc: esc.reading(_LIVE),
+    "info": lambda esc: esc.reading(_INFO),
+    "last_live": lambda esc: esc.reading(_LAST_LIVE),
+    "last_info": lambda esc: esc.reading(_LAST_INFO),
+    "device": lambda esc: esc.protocol.value("device_raw", esc.reading(_LAST_INFO)),
     "link": lambda esc: LinkState(esc._state.link),
     "layout": lambda esc: esc._state.layout,
     "cells": lambda esc: esc._state.cells,
@@ -116,7 +125,7 @@ _WRITABLE = {name: _count(COUNTS.index(name)) for name in _COUNTS} | {
     "energy_mw_ns": property(_energy, _set_energy),
     "run_time_ns": property(lambda esc: esc._state.run_time, _set_run_time),
 }
-"""A capture of a later part begins with what was before."""
+"""Attributes that can be set. A later part of a capture begins with the earlier values."""
 for _name, _property in _WRITABLE.items():
     setattr(NativeEsc, _name, _property)
 
@@ -125,7 +134,7 @@ _GATEWAY_STATES, _CAN_STATES = tuple(GatewayState), tuple(CanState)
 
 
 class NativeStatus(c.Structure):
-    """As GatewayStatus, in the core's memory: kcg.gateway."""
+    """The twin of GatewayStatus in the core's memory (kcg.gateway)."""
 
     _fields_ = tuple(
         (f"{name}_number" if name == "can_state" else name, c.c_int64) for name in GATEWAY

@@ -1,7 +1,9 @@
-"""Compiled messages -> the tables of the core in C (core.h, kcg_plan), in this machine's layout. NotInCore for what it cannot express.
+"""Makes the tables of the core in C (core.h, kcg_plan) from compiled messages.
 
-The proofs are in scale.py: no product leaves int64, whatever value comes and whatever settings within the limits. What cannot be proven
-runs on the Python core; settings beyond them that a master writes to 2100h leave the speeds that they divide not available.
+Raises NotInCore for a message that the core in C cannot express. scale.py proves that no product
+leaves int64, for any value and any settings within the limits. A message without this proof runs
+on the core in Python. If a CANopen master writes settings beyond the limits to object 2100h, the
+speeds that they divide are not available.
 """
 
 import struct
@@ -20,6 +22,7 @@ from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import (
     COUNTS,
     GATEWAY,
+    WIRE_TYPES,
     Message,
     NotInCore,
     Pair,
@@ -34,10 +37,9 @@ from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 from kontronik_can_gw.status import GatewayState
 
-WIRE = {"B": KCG.U8, "b": KCG.I8, "H": KCG.U16, "h": KCG.I16, "I": KCG.U32}
 ALL_ESCS = 255
 MAX_ROWS = 0xFFFF
-"""Of a table that is addressed by 16 bits."""
+"""Number of rows of a table whose index has 16 bits."""
 MAX_ALIVE, MAX_BITS = 1 << 16, 64
 _DIVISORS = {
     Divisor.ONE: KCG.BY_ONE,
@@ -49,7 +51,7 @@ _M64 = (1 << 64) - 1
 
 
 class Tables:
-    """Rows of each table, in the order of their fields."""
+    """The tables of the core for a layout."""
 
     def __init__(self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False) -> None:
         self._plans = layout.messages
@@ -59,15 +61,10 @@ class Tables:
         self.esc_of: list[int] = []
         self.pages = 0
         self.settings = [settings_of(esc) for esc in escs]
-        self.wire = ""
-        """The fields that the tables were made for."""
-        for settings in escs:
-            if (wire := protocol_named(settings.protocol).wire) is not None:
-                self.wire = " ".join(codes for codes, _ in wire)
-        self.watched: list[int] = []
-        """Of each slot."""
+        self.slots: list[Any] = []
+        """A row of kcg_slot_row for each slot."""
         self.listeners_of: list[list[int]] = [[] for _ in escs]
-        """The messages that follow events of each ESC."""
+        """For each ESC, the messages that follow its events."""
         self._wire = [places_of(protocol_named(esc.protocol)) for esc in escs]
         starts = phases([plan.cycle_ns for plan in layout.messages])
         if len(escs) >= ALL_ESCS or len(layout.messages) > 0xFFFF:
@@ -88,7 +85,7 @@ class Tables:
 
     @property
     def names(self) -> dict[str, list[str]]:
-        """Names of the rows of messages and signals."""
+        """Names of the rows of the tables of messages and signals."""
         signals = [
             f"{plan.name}.{signal.name}"
             for plan in self._plans
@@ -99,17 +96,17 @@ class Tables:
 
     @property
     def listeners(self) -> list[int]:
-        """``listeners_of`` all ESCs, one after the other."""
+        """``listeners_of`` of all ESCs, one after the other."""
         return [index for each in self.listeners_of for index in each]
 
     @property
     def first_listeners(self) -> list[int]:
-        """Where those of each ESC begin in ``listeners``, and where the last end."""
+        """The first index in ``listeners`` of each ESC, and the length of ``listeners``."""
         return [*accumulate(map(len, self.listeners_of), initial=0)]
 
     @property
     def arrays(self) -> dict[str, tuple[Any, Any]]:
-        """The tables of kcg_plan in its order: their type and rows."""
+        """Type and rows of each table of kcg_plan, by name."""
         return {
             "message": (Message, self.messages),
             "signal": (Signal, self.signals),
@@ -123,23 +120,23 @@ class Tables:
 
     @property
     def counts(self) -> dict[str, int]:
-        """The numbers of kcg_plan in its order."""
-        words, escs, slots = len(self.constants), len(self.settings), len(self.watched)
+        """The numbers of kcg_plan, by name."""
+        words, escs, slots = len(self.constants), len(self.settings), len(self.slots)
         counts = {"words": words, "messages": len(self.messages) - slots, "escs": escs}
         return counts | {"pages": self.pages, "slots": slots}
 
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
         crc = next((s for s in plan.compiled if s.role is Role.CRC), None)
         traits = Traits(plan, silent)
-        flags = (
-            KCG.EVENT * traits.by_event
-            | KCG.ON_CHANGE * traits.on_change
-            | KCG.HAS_CRC * (crc is not None)
-        )
-        flags |= KCG.SILENT * traits.silent_able | KCG.OF_THE_GATEWAY * traits.follows_gateway
+        flags = KCG.EVENT * traits.by_event
+        flags |= KCG.ON_CHANGE * traits.on_change
+        flags |= KCG.HAS_CRC * (crc is not None)
+        flags |= KCG.SILENT * traits.silent_able
+        flags |= KCG.OF_THE_GATEWAY * traits.follows_gateway
         flags |= KCG.FREE * traits.is_free
-        first, words = len(self.signals), max(1, -(-plan.length // 8))
+        first_signal = len(self.signals)
         first_word = len(self.constants)
+        words = max(1, -(-plan.length // 8))
         for page in plan.pages:
             self.constants += _constants(plan, page, words)
         for signal in plan.signals:
@@ -147,23 +144,35 @@ class Tables:
                 self._add_signal(signal, plan, crc is not None)
         first_esc = len(self.esc_of)
         self.esc_of += sorted(plan.escs)
-        self.messages.append(
-            Message(
-                plan.can_id | (EXTENDED if plan.extended else 0),
-                *(plan.length, words, flags, traits.triggers, len(plan.pages)),
-                *(crc.pieces[0].at // 8 if crc else 0, len(plan.escs), int(plan.fd)),
-                *(first, len(self.signals) - first, plan.data_id & 0xFFFF, self.pages),
-                *(max(0, traits.alive_modulus - 1), first_word, first_esc),
-                *(plan.cycle_ns, plan.delay_ns, phase),
-            )
+        row = Message(
+            id=plan.can_id | (EXTENDED if plan.extended else 0),
+            length=plan.length,
+            words=words,
+            flags=flags,
+            triggers=traits.triggers,
+            pages=len(plan.pages),
+            crc_at=crc.pieces[0].at // 8 if crc else 0,
+            escs=len(plan.escs),
+            fd_flags=int(plan.fd),
+            first_signal=first_signal,
+            signals=len(self.signals) - first_signal,
+            data_id=plan.data_id & 0xFFFF,
+            first_page=self.pages,
+            last_alive=max(0, traits.alive_modulus - 1),
+            first_word=first_word,
+            first_esc=first_esc,
+            cycle=plan.cycle_ns,
+            delay=plan.delay_ns,
+            phase=phase,
         )
+        self.messages.append(row)
         self.pages += len(plan.pages)
 
     def _add_signal(self, signal: SignalPlan, plan: MessagePlan, has_crc: bool) -> None:
         if signal.length > MAX_BITS:
             raise NotInCore(f"{plan.name}.{signal.name}: {signal.length} bits")
         first_piece = len(self.pieces)
-        for piece in signal.pieces:  # never across 64 bits
+        for piece in signal.pieces:  # split at borders of 64 bits
             width = min(piece.width, 64 - piece.at % 64)
             self.pieces.append(Piece(piece.shift, width, piece.at))
             if width < piece.width:
@@ -202,7 +211,7 @@ class Tables:
 
 
 Places = tuple[list[tuple[int, int]], list[tuple[int, int]]]
-"""Offset after the header and wire type of each word of live data and of info."""
+"""Offset after the header and wire type of each word, for live data and info data."""
 _KINDS = {
     Kind.INTEGRAL: KCG.OF_ENERGY,
     Kind.RUN_TIME: KCG.OF_RUN_TIME,
@@ -210,11 +219,11 @@ _KINDS = {
     Kind.RATE: KCG.OF_RATE,
 }
 _NAME_OF = {"received_bytes": "bytes", "live_counter": "live_frames"}
-"""Of values that are one of COUNTS under another name."""
+"""Values that have another name in COUNTS."""
 
 
 def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
-    """Where the steps of a value come from, in a row of Signal. NotInCore where the core does not have it."""
+    """Enter the source of a value into a row of Signal. Raises NotInCore if the core has none."""
     row.divisor = _DIVISORS[value.divisor]
     name = _NAME_OF.get(value.name, value.name)
     if value.kind in (Kind.WIRE, Kind.BITS):
@@ -247,14 +256,14 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
 
 
 def places_of(protocol: EscProtocol) -> Places:
-    """Offset after the header and wire type of each word of live data and of info."""
+    """Return offset and wire type of each word. Raises NotInCore if C cannot decode the protocol."""
     if protocol.wire is None:
         raise NotInCore(f"ESC protocol {protocol.name}")
     found: Places = ([], [])
     for places, (codes, _) in zip(found, protocol.wire, strict=True):
         at = 0
         for code in codes:
-            places.append((at, WIRE[code]))
+            places.append((at, WIRE_TYPES[code]))
             at += struct.calcsize("<" + code)
     return found
 

@@ -1,4 +1,7 @@
-"""Whole turns of the loop in C (linux.c), by ctypes: the structures of linux.h, and what is left of a turn."""
+"""Whole turns of the loop in C (linux.c), through ctypes.
+
+The structures are those of linux.h, which describes their fields.
+"""
 
 import ctypes as c
 import struct
@@ -12,58 +15,80 @@ from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.times import NEVER
 
 OUTPUTS = 1 << 29
-"""Found: time is to pass for the outputs."""
+"""The event KCG_OUTPUTS: let time pass for the outputs."""
 _ENTRY = struct.Struct("=qqIBBxx")
 _CLASSIC = struct.Struct("=IB3x8s")
 _FRAME_SIZE = c.sizeof(Frame)
 
 
-Input, _PollFd = structure("kcg_input"), structure("pollfd")
+Input = structure("kcg_input")
+_PollFd = structure("pollfd")
 _Turns = structure("kcg_turns")
-_FRAMES, _ENTRIES = _Turns.frames.offset, _Turns.ring.offset
+_FRAMES = _Turns.queue.offset + structure("kcg_turn_queue").frame.offset
+"""Offset of the waiting frames in kcg_turns."""
+_ENTRIES = _Turns.ring.offset
+"""Offset of the recorded calls in kcg_turns."""
 
 
 class Turns:
-    """Turns of a loop whose core is in C. ``state``: kcg_turns, of which the owner sets times, socket and limits before ``run``."""
+    """Turns of a loop whose core is in C.
+
+    The owner fills ``request`` and ``times``, then calls ``begin`` and ``run``, and reads
+    ``result``.
+    """
 
     def __init__(self, library: Any, core: Any, escs: int) -> None:
         self.inputs: Any = (Input * escs)()
-        for esc, one in enumerate(self.inputs):
-            one.esc, one.undrained_ns = esc, NEVER
-        self.state = _Turns(core=core, inputs=c.addressof(self.inputs), epoll=-1)
-        self._address = address = c.byref(self.state)
+        for esc, port_input in enumerate(self.inputs):
+            port_input.esc = esc
+            port_input.undrained_ns = NEVER
+        self._state = _Turns(core=core, inputs=c.addressof(self.inputs))
+        self.request: Any = self._state.request
+        self.times: Any = self._state.times
+        self.result: Any = self._state.result
+        self._reads: Any = self._state.reads
+        self._queue: Any = self._state.queue
+        self._ports: Any = self._state.ports
+        self._ports.epoll = -1
+        self._address = address = c.byref(self._state)
         self._watch = library.kcg_watch
         self.begin = partial(library.kcg_begin, address)
-        """To be called before the first ``run``."""
+        """Start a run. To be called before the first ``run``."""
         self.run: Callable[[], int] = partial(library.kcg_turn, address)
-        """Turn until there is something for the loop: 0; or an event is to be followed: then it is to be called again, or ``leave``."""
+        """Make turns until the loop has something to do (0), or an event is to be followed (1).
+
+        After an event call it again, or call ``leave``.
+        """
         self.leave = partial(library.kcg_leave, address)
-        """The rest of the turn is the loop's."""
-        self._raw = memoryview(self.state).cast("B")
-        self._spoken: list[CanFrame] = []
-        """The last frames of ``speak``: at least those that are not sent."""
+        """Leave the rest of the turn to the loop."""
+        self._raw = memoryview(self._state).cast("B")
+        self._output_frames: list[CanFrame] = []
+        """The last frames of ``add_output_frames``: at least those that were not sent."""
 
     def watch(self, descriptors: Sequence[tuple[int, int, int | None]]) -> bool:
-        """(descriptor, what to wait for, ESC whose port it is) from now on. False: that cannot be."""
+        """Watch these descriptors from now on. Return False if that is impossible.
+
+        Each is a descriptor, the events of poll, and the number of the ESC whose port it is.
+        """
         if len(descriptors) > KCG.FDS:
             return False
-        state = self.state
-        state.count = len(descriptors)
+        ports = self._ports
+        ports.count = len(descriptors)
         for place, (fd, events, esc) in enumerate(descriptors):
-            state.fds[place] = _PollFd(fd, events, 0)
-            state.input_of[place] = -1 if esc is None else esc
+            ports.fds[place] = _PollFd(fd, events, 0)
+            ports.input_of[place] = -1 if esc is None else esc
         return bool(self._watch(self._address))
 
     def close(self) -> None:
-        """Wait for nothing any more."""
+        """Watch nothing any more."""
         self.watch(())
 
-    def speak(self, frames: Sequence[CanFrame]) -> bool:
-        """Let what outputs have made of an event be sent before the core's frames. False where that is the loop's."""
-        state, raw = self.state, self._raw
-        waiting = state.unsent
+    def add_output_frames(self, frames: Sequence[CanFrame]) -> bool:
+        """Queue frames of outputs before the core's. Return False if the loop must send them."""
+        queue, raw = self._queue, self._raw
+        waiting = queue.count
         count = waiting + len(frames)
-        if waiting != state.spoken or count > KCG.MADE:
+        if waiting != queue.from_outputs or count > KCG.MADE:
             return False
         at = _FRAMES + waiting * _FRAME_SIZE
         for can_id, data, extended, fd, _, remote, _ in frames:
@@ -71,38 +96,59 @@ class Turns:
                 return False
             _CLASSIC.pack_into(raw, at, can_id | EXTENDED if extended else can_id, len(data), data)
             at += _FRAME_SIZE
-        if not waiting:  # when the bus was full before says nothing of these
-            state.full_since = state.now
-            self._spoken = []
-        self._spoken += frames
-        state.unsent = state.spoken = count
-        state.taken += len(frames)
+        if not waiting:  # how long the bus was full before does not count for these
+            queue.full_since = self.times.now
+            self._output_frames = []
+        self._output_frames += frames
+        queue.count = queue.from_outputs = count
+        self.result.taken += len(frames)
         return True
 
+    @property
+    def has_unread(self) -> bool:
+        """True if the core was given bytes that it has not processed."""
+        return bool(self._reads.size)
+
     def read(self) -> tuple[int, bytes, int, int]:
-        """What the core has been given and not taken yet, as the arguments of Core.receive."""
-        state = self.state
-        esc = state.input_of[state.place[state.at]]
-        return esc, bytes(state.data[: state.size]), state.now, state.since
+        """Return the bytes that the core has not processed, as arguments of Core.receive."""
+        reads = self._reads
+        esc = self._ports.input_of[reads.place[reads.at]]
+        return esc, bytes(reads.data[: reads.size]), self.times.now, reads.since
+
+    @property
+    def has_advanced(self) -> bool:
+        """True if kcg_advance was called in the turn."""
+        return bool(self._reads.has_advanced)
 
     def ready(self) -> list[tuple[int, int]]:
-        """The descriptors that are ready, with what happened."""
-        ready = [each for each in self.state.fds[: self.state.count] if each.revents]
+        """Return the descriptors that are ready, with the events of poll."""
+        ports = self._ports
+        ready = [each for each in ports.fds[: ports.count] if each.revents]
         return [(each.fd, each.revents) for each in ready]
 
+    @property
+    def full_since(self) -> int:
+        """Time in ns since which the bus has taken no frame."""
+        return int(self._queue.full_since)
+
     def unsent(self) -> list[CanFrame]:
-        """The frames that the bus did not take, in their order."""
-        state = self.state
-        frames = frames_in(self._raw, _FRAMES, state.unsent)
-        spoken = self._spoken[-state.spoken :] if state.spoken else []
-        return spoken + frames[state.spoken :]
+        """Return the frames that the bus did not take, in their order."""
+        queue = self._queue
+        if not queue.count:
+            return []
+        frames = frames_in(self._raw, _FRAMES, queue.count)
+        from_outputs = queue.from_outputs
+        first = self._output_frames[-from_outputs:] if from_outputs else []
+        return first + frames[from_outputs:]
 
     def entries(self) -> Iterator[tuple[int, int, int, bytes, int | None]]:
-        """What was recorded: (time, kind, ESC, data, since when it can have come), in its order."""
+        """Yield the recorded calls in their order: time, kind, ESC, data, since when it can be."""
         at, raw = _ENTRIES, self._raw
-        end = at + self.state.recorded
+        end = at + self.result.recorded
         while at < end:
             now, came, size, kind, esc = _ENTRY.unpack_from(raw, at)
             at += _ENTRY.size
-            yield now, kind, esc, bytes(raw[at : at + size]), None if came == NEVER else came
+            data = bytes(raw[at : at + size])
+            since = None if came == NEVER else came
+            yield now, kind, esc, data, since
             at += -(-size // 8) * 8

@@ -1,1 +1,1 @@
-"""Everything that blocks, reads a clock or opens a port: around the pure core, and nowhere else when live."""
+"""All code of the live gateway that blocks, reads a clock or opens a port."""

@@ -1,4 +1,8 @@
-"""What the loop does now and then, not with each frame: line errors, sums of the log, captures' reports, statistics, signs of life."""
+"""Does the loop's periodic work, about once a second.
+
+It counts line errors, updates the log, collects the recorder's reports, publishes the status
+document, and sends status and keep-alive to the service manager.
+"""
 
 import gc
 import logging
@@ -29,21 +33,22 @@ log = logging.getLogger("kontronik_can_gw")
 
 ROUND_NS = SECOND
 MAX_LATE_NS = SECOND // 2
-"""The loop is woken for a round only if the round is late by this much: usually something else wakes the loop before."""
+"""Delay after which a due round wakes the loop, which usually wakes earlier for other reasons."""
 PROCESS_NS = 10 * SECOND
-"""How often the process's resources are asked for: that costs more than the rest of a round."""
+"""Interval between queries of the process's resources. One costs more than the rest of a round."""
 COLLECT_NS = 60 * SECOND
 """Interval of full garbage collections, which take less than a millisecond.
 
-CPython keeps up to 2 000 freed tuples of each size for later use, some MB in all, and frees them only in a full collection. None runs by
-itself (cli/run.py, ``settle_memory``). The objects of the start are frozen, so that a collection does not visit them.
+CPython keeps up to 2 000 freed tuples of each size for later use, some MB in all, and frees them
+only in a full collection. Automatic collections are off (cli/run.py, ``settle_memory``). The
+objects of the start are frozen, so that a collection does not visit them.
 """
 STATUS_NS = SECOND
-"""The service manager is given a line at most this often."""
+"""Shortest interval between two status lines for the service manager."""
 
 
 class Housekeeping:
-    """``due``: when ``run`` has something to do; ``wake_due``: when the loop is to be woken for it."""
+    """The periodic work of the loop."""
 
     def __init__(
         self,
@@ -58,7 +63,10 @@ class Housekeeping:
         recorder: "Recorder | None",
         program: ProgramFacts,
     ) -> None:
-        self.due = self.wake_due = 0
+        self.due = 0
+        """Time of the next round, if the loop is awake then."""
+        self.wake_due = 0
+        """Time at which the loop must wake up for the round."""
         self._gateway = gateway
         self._escs = escs
         self._can = can
@@ -69,12 +77,14 @@ class Housekeeping:
         self._recorder = recorder
         self._program = program
         self._alive_due = 0 if notifier.watchdog_ns is not None else None
+        """Time of the next keep-alive. None if the service manager expects none."""
         self._notify_due = 0
         self._collect_due: int | None = None
-        self._process, self._process_due = ProcessFacts(), 0
+        self._process = ProcessFacts()
+        self._process_due = 0
 
     def run(self, now: int) -> None:
-        """One round."""
+        """Do one round of the periodic work."""
         self.due = now + ROUND_NS
         for esc in self._escs:
             esc.report(now)
@@ -86,11 +96,13 @@ class Housekeeping:
         self._notify(now)
         self._collect(now)
         self.wake_due = self.due + MAX_LATE_NS
-        if (due := self._alive_due) is not None and due > now:  # else something is stuck
-            self.due, self.wake_due = min(self.due, due), min(self.wake_due, due)
+        # A keep-alive that is overdue was not sent because a port is stuck.
+        if self._alive_due is not None and self._alive_due > now:
+            self.due = min(self.due, self._alive_due)
+            self.wake_due = min(self.wake_due, self._alive_due)
 
     def _collect(self, now: int) -> None:
-        """Free what the interpreter keeps of freed objects, once a minute."""
+        """Free the memory that the interpreter keeps for reuse, once a minute."""
         if self._collect_due is not None and now >= self._collect_due:
             gc.collect()
             self._collect_due = None
@@ -98,7 +110,7 @@ class Housekeeping:
             self._collect_due = now + COLLECT_NS
 
     def publish(self, now: int) -> None:
-        """Hand the statistics' thread what a document is made of, if it is time."""
+        """Hand the data for a status document to the thread that writes it, if one is due."""
         statistics = self._statistics
         if statistics is None:
             return
@@ -120,11 +132,12 @@ class Housekeeping:
 
     def _process_now(self, now: int) -> ProcessFacts:
         if now >= self._process_due:
-            self._process_due, self._process = now + PROCESS_NS, process_facts()
+            self._process_due = now + PROCESS_NS
+            self._process = process_facts()
         return self._process
 
     def follow_recorder(self, now: int) -> None:
-        """Give the recorder what a replay needs to know, and log what it reports."""
+        """Give the gateway's state to the recorder, and log the recorder's faults."""
         if self._recorder is None:
             return
         self._recorder.note(self._gateway, now)
@@ -132,7 +145,10 @@ class Housekeeping:
 
     def _log(self, reports: Sequence[Report], now: int) -> None:
         for name, begins, text in reports:
-            (self._conditions.begin if begins else self._conditions.end)(name, text, now)
+            if begins:
+                self._conditions.begin(name, text, now)
+            else:
+                self._conditions.end(name, text, now)
 
     def report_outputs(self, now: int) -> None:
         """Log rejected parameters and what the outputs report, such as new states of nodes."""
@@ -148,22 +164,24 @@ class Housekeeping:
                 self._conditions.event(subject, text, now, logging.INFO)
 
     def _log_conflicts(self, now: int) -> None:
-        """Others on the bus begin, or cease, to send with our ids."""
+        """Log the begin and the end of conflicts with other devices that send with our ids."""
         for conflict in self._gateway.conflicts.take():
-            which = f"CAN {self._can.config.channel}: {conflict.ids}"
+            condition = f"CAN {self._can.config.channel}: {conflict.ids}"
             if conflict.over:
-                text = f"{which}: nobody else sends with it"
-                self._conditions.end(which, text, now, f"; {conflict.count} frames")
+                text = f"{condition}: nobody else sends with it"
+                self._conditions.end(condition, text, now, f"; {conflict.count} frames")
                 continue
-            change = "Change one, as by dbc.base_id."
-            remedy = change if conflict.node is None else "Two nodes with one node-ID?"
+            remedy = "Two nodes with one node-ID?"
+            if conflict.node is None:
+                remedy = "Change one, as by dbc.base_id."
             text = (
-                f"{which}: somebody else sends with it too; here it is {conflict.whose}. {remedy}"
+                f"{condition}: somebody else sends with it too; "
+                f"here it is {conflict.whose}. {remedy}"
             )
-            self._conditions.begin(which, text, now)
+            self._conditions.begin(condition, text, now)
 
     def status_words(self) -> str:
-        """How things are, in one line."""
+        """Return the states of the interface and the ESCs in one line."""
         state = name_in_words(self._gateway.status.can_state.name)
         words = [f"CAN {self._can.config.channel} {state}"]
         words += [
@@ -173,21 +191,31 @@ class Housekeeping:
         return "; ".join(words)
 
     def _notify(self, now: int) -> None:
-        """Give the service manager a line, and a sign of life while everything is served in time."""
+        """Send a status line to the service manager, and a keep-alive if no port is stuck.
+
+        A port that the loop does not serve in time is a reason to restart the process.
+        """
         if now >= self._notify_due and self._notifier.present:
             self._notify_due = now + STATUS_NS
             self._notifier.status(self.status_words())
         if self._alive_due is None or now < self._alive_due:
             return
-        if any([*(esc.is_stuck() for esc in self._escs), self._can.is_stuck()]):
-            return  # not fed: a port that is not served in time is a reason to begin anew
+        # Each check must be called, because it compares two successive calls.
+        checks = [esc.is_stuck() for esc in self._escs]
+        checks.append(self._can.is_stuck())
+        if any(checks):
+            return
         self._alive_due = now + (self._notifier.watchdog_ns or SECOND)
         self._notifier.watchdog()
 
 
 def _can_facts(can: CanLink, conditions: FaultLog) -> CanFacts:
-    """What the statistics show of the interface."""
-    config, known = can.config, can.controller.facts or LinkFacts(exists=False)
+    """Return the state of the interface for the status document."""
+    config = can.config
+    known = can.controller.facts or LinkFacts(exists=False)
+    bitrate = known.bitrate
+    if not bitrate and config.interface != "socketcan":
+        bitrate = config.bitrate
     faults = (
         can.opening_condition,
         can.condition,
@@ -195,12 +223,12 @@ def _can_facts(can: CanLink, conditions: FaultLog) -> CanFacts:
         can.controller.condition,
     )
     return CanFacts(
-        config.interface,
-        config.channel,
-        known.bitrate or (config.bitrate if config.interface != "socketcan" else None),
-        can.is_open,
-        next(filter(None, map(conditions.reason, faults)), ""),
-        can.transmitter.is_stalled,
-        known.restart_ms,
-        known.error_counters,
+        interface=config.interface,
+        channel=config.channel,
+        bitrate=bitrate or None,
+        open=can.is_open,
+        complaint=next(filter(None, map(conditions.reason, faults)), ""),
+        stalled=can.transmitter.is_stalled,
+        restart_ms=known.restart_ms,
+        error_counters=known.error_counters,
     )

@@ -1,8 +1,9 @@
-"""The live gateway: one loop over serial ports, CAN interface and time. No thread is started here.
+"""Runs the live gateway: one loop over serial ports, CAN interface and time.
 
-What may touch what: everything belongs to the thread that calls ``run``; only ``stop`` may be called from elsewhere (a signal handler,
-another thread). Threads of their own (worker.py) have the parameter store (store.py), the statistics (statistics.py), captures
-(recorder.py), the log (fault_log.py), and of python-can's drivers opening (can_opener.py) and reception (open_can.py).
+Only the thread that calls ``run`` may use this module, except ``stop``, which a signal handler or
+another thread may call. No thread is started here. These parts have their own threads (worker.py):
+the parameter store (store.py), the status document (statistics.py), captures (recorder.py), the log
+(fault_log.py), and opening (can_opener.py) and reception (open_can.py) of python-can's drivers.
 """
 
 import logging
@@ -32,15 +33,16 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.native_poller import NativePoller
 
 _WAKES_PER_TIMEOUT = 4
-"""The loop wakes at least this often within the shortest telemetry time-out: by how much of it a value may go early.
+"""Number of times that the loop wakes at least within the shortest telemetry time-out.
 
-A millisecond sooner, for a wait is rounded up to one.
+A value may expire early by this part of the time-out. The loop wakes a millisecond earlier than
+that, because a wait is rounded up to a millisecond.
 """
 _LAST_SAVE_S = 0.2
 
 
 class Loop:
-    """Owns ports, interface and gateway while it runs."""
+    """Owns the ports, the interface and the gateway while it runs."""
 
     def __init__(
         self,
@@ -65,7 +67,7 @@ class Loop:
         self._statistics = statistics
         self._recorder = recorder
         self._now = self._look_due = self._revision = 0
-        self._due: int | None = None  # not known since something was done
+        self._due: int | None = None  # the next deadline; None if it must be computed again
         self._stopping = False
         self._reason = "stopped"
         self._is_ready = False
@@ -94,17 +96,22 @@ class Loop:
             self._poller.register(store.fileno(), self._saver.take_results)
 
     def stop(self, reason: str = "stopped") -> None:
-        """End ``run`` soon; safe in a signal handler and from another thread. ``reason`` is logged."""
+        """End ``run`` soon, and log ``reason``. A signal handler or another thread may call it."""
         self._reason = reason
         self._stopping = True
         self._wake.wake()
 
     def open(self) -> None:
-        """Open interface and ports. RunError if one is missing, unless the configuration says to wait for it; nothing stays open then."""
+        """Open ports and interface.
+
+        Raises RunError if one cannot be opened, and closes the others, unless the configuration
+        permits waiting for devices.
+        """
         now = self._clock()
-        self.conditions.hold()  # what was opened is logged when all is: an error at start is the only line
+        # If the opening fails, the error is the only line of the log.
+        self.conditions.hold()
         try:
-            # ports first, and locked: so that nothing else, a CAN adapter's driver included, opens them
+            # The ports are opened and locked first, so that no CAN adapter's driver opens them.
             for esc in self.escs:
                 esc.open(now, self._wait, self._others(esc))
             self.can.open(now, self._wait)
@@ -115,12 +122,12 @@ class Loop:
             self.close()
             raise
         if self.can.port is not None:
-            self.can.port.discard()  # a node that has not booted yet receives nothing
+            self.can.port.discard()  # a node must not receive frames from before its boot-up
         self.conditions.release()
-        self._housekeeping.publish(now)  # the first time takes the longest
+        self._housekeeping.publish(now)  # now, because the first call takes the longest
 
     def run(self) -> None:
-        """Until ``stop``. Then a last status is sent and everything is closed."""
+        """Run until ``stop`` is called. Then send a final status and close everything."""
         self.begin()
         try:
             while not self._stopping:
@@ -137,20 +144,24 @@ class Loop:
     def begin(self) -> None:
         """Start the gateway."""
         self._poller.begin()
-        now = self._now = self._clock()
+        now = self._clock()
+        self._now = now
         self.gateway.start(now, self.can.is_open)
-        self.can.follow_ids()  # before the boot-up message: a master may ask as soon as it sees it
+        self.can.follow_ids()  # first, because a master may send requests after the boot-up message
         self.can.transmit(now)
         self._report_ready()
 
     def _report_ready(self) -> None:
-        """Tell the service manager once that the gateway runs: not before an interface that must open is open."""
+        """Report once to the service manager that the gateway runs.
+
+        An interface whose failure ends the gateway must be open before.
+        """
         if not (self._is_ready or self.can.must_open):
             self._is_ready = True
             self._notifier.ready(self._housekeeping.status_words())
 
     def turn(self) -> None:
-        """Wait until something has come or is due, and do it."""
+        """Wait until a descriptor is ready or work is due, and do the work."""
         period = self.gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
         ready = None
         if self._poller.is_native:
@@ -164,12 +175,14 @@ class Loop:
             is_over = self._poller.now < self._due
         else:
             is_over, self._due = self._poller.is_over, None
-        now, late = self._poller.now, self._poller.late
+        now = self._poller.now
+        late = self._poller.late
         held_up = late > MIN_HELD_UP_NS and late > self.can.transmitter.max_turn_ns()
         if held_up:
             self._follow_hold_up(late, now)
         if held_up or ready or not is_over:
-            now, self._due = self._serve(ready, now), None
+            now = self._serve(ready, now)
+            self._due = None
         elif now >= self.can.controller.due:
             self.can.ask(now)
             self._due = None
@@ -183,21 +196,25 @@ class Loop:
             self._due = None
 
     def _serve(self, ready: list[tuple[Handler, int]], now: int) -> int:
-        """Take what has come, do what is due, send what is made of it. Returns the time."""
-        gateway, can = self.gateway, self.can
+        """Call the handlers, do the due work, and send the resulting frames. Returns the time."""
+        gateway = self.gateway
+        can = self.can
         for handler, events in ready:
             handler(now, events)
         if self._lost or can.port is None or now >= can.controller.due:
             now = self._reopen(now)
         has_outputs = gateway.has_outputs
         if has_outputs:
-            self._saver.save(now)  # first: what it answers belongs to this turn, in a replay too
+            self._saver.save(
+                now
+            )  # first, so that its answers are sent in this turn, as in a replay
         gateway.advance(now)
         if has_outputs:
             self._follow_outputs(now)
         can.transmit(now)
         self._report_ready()
-        if changes := gateway.take_link_changes():
+        changes = gateway.take_link_changes()
+        if changes:
             for index in dict.fromkeys(changes):
                 self.escs[index].log.follow_link(now)
         return now
@@ -211,9 +228,9 @@ class Loop:
             self._housekeeping.report_outputs(now)
 
     def end(self) -> None:
-        """A last status is sent and everything is closed."""
+        """Send a final status, log the totals, and close everything."""
         now = self._clock()
-        self._housekeeping.follow_recorder(now)  # what is known of the devices by now
+        self._housekeeping.follow_recorder(now)  # records the devices
         self.gateway.stop(now)
         self.can.transmit(now)
         self.conditions.say(logging.INFO, f"{self._reason} {totals(self.gateway, now)}")
@@ -229,21 +246,21 @@ class Loop:
             self._statistics.close()
         if self._recorder is not None:
             self._recorder.close()
-            self._housekeeping.follow_recorder(self._clock())  # the last words
+            self._housekeeping.follow_recorder(self._clock())  # logs its last faults
         if self._store is not None:
             self._store.close(_LAST_SAVE_S)
-        self._wake.close()  # ``stop`` may still come, without effect
+        self._wake.close()  # later calls of ``stop`` have no effect
 
     def _woken(self, _now: int, _events: int) -> None:
         self._wake.take()
 
     def _next_deadline(self) -> int:
-        if self.gateway.frames_wait:  # of a change that sending itself brought about
+        if self.gateway.frames_wait:  # a change during sending has produced them
             return 0
         return min(self._own_deadline(), self.gateway.next_deadline())
 
     def _own_deadline(self) -> int:
-        """Of what is to be done apart from the gateway."""
+        """Return the time of the next work apart from the gateway's."""
         due = min(self.can.due, self._housekeeping.wake_due)
         for esc in self._lost:
             due = min(due, esc.due)
@@ -253,17 +270,26 @@ class Loop:
         return tuple(other.identity for other in self.escs if other is not esc)
 
     def _esc_at(self, path: str) -> str | None:
-        """The name of the ESC that a path leads to."""
+        """Return the name of the ESC to which a path leads, or None."""
         return next((esc.name for esc in self.escs if esc.is_at(path)), None)
 
     def _follow_hold_up(self, late: int, now: int) -> None:
-        """What was measured before is old; commands and answers are not (how old bytes are, ``since`` says)."""
-        text = f"the process was suspended for {late / SECOND:.1f} s: measurements that waited to be sent are dropped and made anew"
+        """Discard the waiting measurements, which are too old after a hold-up.
+
+        Commands and answers are kept. The age of received bytes is known from ``since``.
+        """
+        text = (
+            f"the process was suspended for {late / SECOND:.1f} s: "
+            "measurements that waited to be sent are dropped and made anew"
+        )
         self.conditions.event("suspended", text, now)
         self.gateway.held_up(now, self.can.transmitter.drop_measurements())
 
     def _reopen(self, now: int) -> int:
-        """Open what is due. Returns the time: it may have taken long on a slow machine."""
+        """Open lost ports and the interface if that is due.
+
+        Returns the time, because opening may take long on a slow machine.
+        """
         for esc in tuple(self._lost):
             esc.reopen(now, self._others(esc))
         self.can.reopen(now)
@@ -273,12 +299,15 @@ class Loop:
 
 
 def totals(gateway: Gateway, now: int) -> str:
-    """What the gateway has done, in one line."""
-    status, escs = gateway.status, gateway.escs
+    """Return the totals of the gateway in one line."""
+    status = gateway.status
+    escs = gateway.escs
     live = sum(esc.counters.live for esc in escs)
     crc_errors = sum(esc.counters.crc_errors for esc in escs)
     losses = sum(esc.losses for esc in escs)
     return (
-        f"after {duration(now - status.started_ns)}: {live} live frames received, {crc_errors} CRC errors, telemetry lost {losses} times; "
-        f"{status.sent_frames} CAN frames sent, {status.dropped_frames} dropped, bus-off {status.bus_off_count} times"
+        f"after {duration(now - status.started_ns)}: {live} live frames received, "
+        f"{crc_errors} CRC errors, telemetry lost {losses} times; "
+        f"{status.sent_frames} CAN frames sent, {status.dropped_frames} dropped, "
+        f"bus-off {status.bus_off_count} times"
     )

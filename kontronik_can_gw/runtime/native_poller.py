@@ -1,4 +1,7 @@
-"""Turns of the loop in C, while the core is there, too, and nothing but plain reads and frames that are due is to be done."""
+"""Runs turns of the loop in C, if the core is in C, too.
+
+The loop in C only reads ports, and sends due frames. It returns for all other work.
+"""
 
 import contextlib
 import os
@@ -20,12 +23,12 @@ if TYPE_CHECKING:
 
 
 def poller_for(gateway: Gateway) -> Poller:
-    """The one that suits the gateway's core."""
+    """Return the poller for the gateway's core."""
     return NativePoller(gateway) if gateway.core.language == "C" else Poller()
 
 
 class NativePoller(Poller):
-    """A poller that can turn. ``count``: turns in C so far."""
+    """A poller that also runs turns of the loop in C. ``count`` is their number."""
 
     is_native = True
 
@@ -35,7 +38,7 @@ class NativePoller(Poller):
         self._gateway = gateway
         self._core = cast("NativeCore", gateway.core)
         self._turns = self._core.turns()
-        self._turns.state.records = gateway.is_recorded
+        self._turns.request.is_recorded = gateway.is_recorded
         self._seen_changes = -1
         self._fits = True
         self._signals: tuple[int, int] | None = None
@@ -45,7 +48,7 @@ class NativePoller(Poller):
         return cast(PortInput, self._turns.inputs[esc])
 
     def begin(self) -> None:
-        """A signal is followed when C is left: let it wake that, at whatever moment it comes."""
+        """Let each signal wake the loop in C, because signal handlers run only after C returns."""
         if threading.current_thread() is threading.main_thread():
             self._signals = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
             self._woken_before = signal.set_wakeup_fd(self._signals[1], warn_on_full_buffer=False)
@@ -68,47 +71,59 @@ class NativePoller(Poller):
     def turn(
         self, can: "CanLink", last: int, due: int, leave: int, period: int
     ) -> list[tuple[Handler, int]] | None:
-        """Turn until something is to be done that is the loop's; the handlers of what is ready then.
+        """Run turns in C until there is work for the loop. Returns the handlers to call then.
 
-        ``last``: the last turn; ``due``: what the loop has to do apart from the gateway; ``leave``: when to come back in any case;
-        ``period``: how long a wait is at most. All in ns. None where it is not the time for that.
+        Returns None if turns in C are not possible now. ``last`` is the time of the last turn,
+        ``due`` of the loop's own next work, and ``leave`` of the latest return. ``period`` is the
+        longest duration of a wait. All are in ns.
         """
         gateway = self._gateway
         if self._core.reports_live or gateway.frames_wait:
             return None
-        if (bus := _plain_socket(can, gateway)) is None or not self._watches():
+        bus = _plain_socket(can, gateway)
+        if bus is None or not self._watches():
             return None
         turns = self._turns
-        state = turns.state
-        state.asked, state.before, state.bus = self.now, self.before, bus
-        state.now, state.leave, state.period = last, leave, period
-        state.max_turn = max_turn = can.transmitter.max_turn_ns()
-        state.max_late = max(MIN_HELD_UP_NS, max_turn)
-        state.due = min(due, self._core.deadline_in_python())
-        state.outputs_due = gateway.next_deadline(with_core=False)
+        request, times, result = turns.request, turns.times, turns.result
+        times.now = last
+        times.polled = self.now
+        times.bus_empty = self.before
+        request.bus = bus
+        request.leave = leave
+        request.due = min(due, self._core.deadline_in_python())
+        request.outputs_due = gateway.next_deadline(with_core=False)
+        self._set_limits(period, can.transmitter.max_turn_ns())
         recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
         if recorded is not None:
             recorded.prepare_turns(last)
         turns.begin()
         while turns.run():
             if not self._follow():
-                self._core.follow_others(state.now)
-                if state.size:
+                self._core.follow_others(times.now)
+                if turns.has_unread:
                     self._core.receive(*turns.read())
                 turns.leave()
                 break
-        self.count += state.turns
-        self.before, self.now, self.late = state.before, state.asked, state.late
+        self.count += result.turns
+        self.before = times.bus_empty
+        self.now = times.polled
+        self.late = result.late
         if recorded is not None:
-            recorded.turned(turns.entries(), state.taken)
-        self.is_over = bool(state.is_over)
-        if state.unsent:
-            can.transmitter.put_refused(turns.unsent(), state.full_since)
-        if state.found >= 0 and state.advanced:  # it ends at its own time, as in a replay
-            self._core.advance_in_python(state.now)
-            gateway.advance(state.now, with_core=False)
-            can.transmit(state.now)
-        return self.handlers(turns.ready()) if state.happened else []
+            recorded.turned(turns.entries(), result.taken)
+        self.is_over = bool(result.is_over)
+        if unsent := turns.unsent():
+            can.transmitter.put_refused(unsent, turns.full_since)
+        if result.event >= 0 and turns.has_advanced:  # it ends at its own time, as in a replay
+            self._core.advance_in_python(times.now)
+            gateway.advance(times.now, with_core=False)
+            can.transmit(times.now)
+        return self.handlers(turns.ready()) if result.happened else []
+
+    def _set_limits(self, period_ns: int, max_turn_ns: int) -> None:
+        request = self._turns.request
+        request.period = period_ns
+        request.max_turn = max_turn_ns
+        request.max_late = max(MIN_HELD_UP_NS, max_turn_ns)
 
     def _follow(self) -> bool:
         """Follow the event that C has come back with, or let time pass for the outputs; False where the rest of the turn is the loop's.
@@ -116,20 +131,21 @@ class NativePoller(Poller):
         As a rule nothing but frames comes of it, if anything, and C sends them first.
         """
         gateway, core, turns = self._gateway, self._core, self._turns
-        state = turns.state
+        request = turns.request
+        event, now = turns.result.event, turns.times.now
         revision = gateway.revision
-        if is_due := state.found == OUTPUTS:
-            gateway.advance(state.now, with_core=False)
+        if is_due := event == OUTPUTS:
+            gateway.advance(now, with_core=False)
         else:
-            core.follow(state.found, state.now)
+            core.follow(event, now)
         if core.link_changes or core.reports_live or gateway.revision != revision:
             return False
-        state.outputs_due = due = gateway.next_deadline(with_core=False)
-        state.due = min(state.due, core.deadline_in_python())
-        if state.now >= (min(state.due, due) if is_due else state.due):
+        request.outputs_due = outputs_due = gateway.next_deadline(with_core=False)
+        request.due = due = min(request.due, core.deadline_in_python())
+        if now >= (min(due, outputs_due) if is_due else due):
             return False
         if frames := gateway.output_frames:
-            if not turns.speak(frames):
+            if not turns.add_output_frames(frames):
                 return False
             frames.clear()
         return True
@@ -142,7 +158,7 @@ class NativePoller(Poller):
 
 
 def _plain_socket(can: "CanLink", gateway: Gateway) -> int | None:
-    """The interface's socket, while frames can be handed to it without further ado."""
+    """Return the interface's socket if C can hand frames to it now, otherwise None."""
     port = can.port
     is_plain = can.is_proven and can.transmitter.is_idle and not can.controller.is_off
     if port is None or port.gone or not is_plain or port.state is not gateway.status.can_state:

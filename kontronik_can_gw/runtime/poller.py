@@ -1,8 +1,11 @@
-"""Waiting for many descriptors at once, with a handler for each: epoll waits, at a cost that does not grow with them, poll is asked.
+"""Waits for many descriptors, each with a handler.
 
-What is ready, and what was not at a known time, is asked for once more after each wait: a process that was stopped while it waited is
-answered that nothing has come once the wait's time is over (PEP 475). And by poll, not epoll, which does not ask a terminal whether
-bytes are still on their way to it inside the kernel.
+epoll waits, because its cost does not grow with the number of descriptors. After each wait, poll
+finds the descriptors that are ready, and proves that the others were not ready at a known time:
+
+1. If the process is suspended during a wait that ends by time, epoll reports no descriptor, even if
+   one has become ready meanwhile (PEP 475).
+2. epoll does not check whether a terminal has bytes that are still on their way inside the kernel.
 """
 
 import contextlib
@@ -14,7 +17,7 @@ from kontronik_can_gw.runtime.port_input import PortInput
 from kontronik_can_gw.times import MS, SECOND
 
 Handler = Callable[[int, int], None]
-"""Called with the time and what has happened (select.POLLIN, POLLOUT)."""
+"""Called with the time and the events (select.POLLIN, POLLOUT)."""
 
 
 MIN_HELD_UP_NS = 20 * MS
@@ -42,12 +45,15 @@ class Poller:
         self._epoll = select.epoll()
         self._watched: dict[int, tuple[Handler, int, int | None]] = {}
         self._closed: set[int] = set()
-        """Watched, but closed by a driver: they would stay readable."""
+        """Watched descriptors that a driver has closed. They would always be readable."""
 
     def register(
         self, fd: int, handler: Handler, events: int = _IN, esc: int | None = None
     ) -> None:
-        """Watch a descriptor; one that is watched, for something else from now on. ``esc``: it is this one's port."""
+        """Watch a descriptor. If it is already watched, handler and events are replaced.
+
+        ``esc`` is the number of the ESC if the descriptor is the port of an ESC.
+        """
         self._poll.register(fd, events)
         try:
             self._epoll.register(fd, events)
@@ -58,30 +64,32 @@ class Poller:
         self.changes += 1
 
     def unregister(self, fd: int) -> None:
-        """Watch it no longer. KeyError if it was not watched."""
+        """Stop watching a descriptor. Raises KeyError if it is not watched."""
         del self._watched[fd]
         self.changes += 1
         with contextlib.suppress(KeyError):
             self._poll.unregister(fd)
-        with contextlib.suppress(OSError):  # it is closed already
+        with contextlib.suppress(OSError):  # it is already closed
             self._epoll.unregister(fd)
 
     def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
-        """Wait until something happens, ``due`` has come (rounded up to a millisecond), or a signal comes; then ask what is ready.
+        """Wait for an event, a signal, or the time ``due``, rounded up to a millisecond.
 
-        ``last``: time of the last turn. Returns handlers of what there is, with what.
+        ``last`` is the time of the last turn. Returns the handlers of the ready descriptors, with
+        their events.
         """
         pause = due - self._clock()
         if pause > 0:
             self._epoll.poll(pause / SECOND, 1)
         else:
             pause = 0
-        self.before, self.now = self.now, self._clock()
+        self.before = self.now
+        self.now = self._clock()
         self.late = self.now - last - pause
         return self.handlers(self._poll.poll(0))
 
     def handlers(self, happened: list[tuple[int, int]]) -> list[tuple[Handler, int]]:
-        """Of descriptors and what poll says of them."""
+        """Return the handlers of ready descriptors, given with poll's events."""
         watched = self._watched
         return [
             (watched[fd][0], bits if bits == _IN else self._events(fd, bits))
@@ -89,14 +97,14 @@ class Poller:
         ]
 
     def noted(self, _esc: int) -> PortInput:
-        """What is noted while an ESC's port is read."""
+        """Return the notes of an ESC's port."""
         return PortInput()
 
     def begin(self) -> None:
-        """The loop begins."""
+        """Prepare for the first turn of the loop."""
 
     def watched(self) -> list[tuple[int, int, int | None]]:
-        """The descriptors that are watched, for what, and whose port each is."""
+        """Return the watched descriptors, with their events and the number of their ESC."""
         return [
             (fd, events, esc)
             for fd, (_, events, esc) in self._watched.items()

@@ -73,22 +73,28 @@ class Part:
     """Number of columns."""
     plan: MessagePlan
     page: int | None
+    unpacker: "Unpacker"
+    """Decodes the columns."""
 
 
-_Unpack = Callable[[int], list[Value]]
-
-
-class _Message(NamedTuple):
-    """Functions that decode the frames of one message."""
+class FrameParts(NamedTuple):
+    """Which parts the frames of one message have. Parts are indices of ``SignalReader.parts``."""
 
     length: int
+    """Shorter frames are ignored."""
+    common: tuple[int, ...]
+    """The part that is in every frame, if there is one."""
+    paged: dict[int, int]
+    """The part of each page, which is in the frames with this value of the multiplexer."""
     page_of: Callable[[int], int] | None
     """Returns the multiplexer's value. None if the message has no multiplexer."""
-    unpacks: dict[int | None, tuple[int, _Unpack]]
-    """For each page, the index of its first column and the function that decodes its values.
 
-    The page None is in every frame.
-    """
+    def in_frame(self, bits: int) -> tuple[int, ...]:
+        """Return the parts that a frame has."""
+        if self.page_of is None:
+            return self.common
+        page = self.paged.get(self.page_of(bits))
+        return self.common if page is None else (*self.common, page)
 
 
 class SignalReader:
@@ -98,52 +104,46 @@ class SignalReader:
         self.layout = layout
         columns: list[Column] = []
         self.parts: list[Part] = []
-        self._messages: dict[int, _Message] = {}
+        self.messages: dict[int, FrameParts] = {}
+        """The layout's messages by CAN id, with ``EXTENDED`` for ids of 29 bits."""
         for plan in layout.messages:
             key = plan.can_id | (EXTENDED if plan.extended else 0)
             all_signals = plan.signals
-            unpacks: dict[int | None, tuple[int, _Unpack]] = {}
+            part_of_page: dict[int | None, int] = {}
             for page in dict.fromkeys((None, *plan.pages)):
                 signals = [s for s in all_signals if s.role is Role.SOURCE and s.page == page]
                 if not signals:
                     continue
-                self.parts.append(Part(len(columns), len(signals), plan, page))
-                unpacks[page] = (len(columns), unpack_of(signals))
+                part_of_page[page] = len(self.parts)
+                part = Part(len(columns), len(signals), plan, page, Unpacker(signals))
+                self.parts.append(part)
                 columns += [_column(signal, plan, key) for signal in signals]
             page_of = None
             for signal in all_signals:
                 if signal.role is Role.MULTIPLEXER:
                     page_of = partial(extract, signal.pieces)
                     break
-            self._messages[key] = _Message(plan.length, page_of, unpacks)
+            common = tuple(part for page, part in part_of_page.items() if page is None)
+            paged = {page: part for page, part in part_of_page.items() if page is not None}
+            self.messages[key] = FrameParts(plan.length, common, paged, page_of)
         self.columns = tuple(columns)
 
     @property
     def keys(self) -> frozenset[int]:
         """CAN ids of the layout's messages, with ``EXTENDED`` for ids of 29 bits."""
-        return frozenset(self._messages)
+        return frozenset(self.messages)
 
     def read(self, key: int, data: bytes) -> list[Chunk] | None:
         """Return the values of a frame.
 
         None if the layout has no message with this id, or if the frame is shorter than its message.
         """
-        message = self._messages.get(key)
+        message = self.messages.get(key)
         if message is None or len(data) < message.length:
             return None
-        length, page_of, unpacks = message
-        bits = int.from_bytes(data[:length], "little")
-        chunks = []
-        common = unpacks.get(None)
-        if common is not None:
-            first, unpack = common
-            chunks.append((first, unpack(bits)))
-        if page_of is not None:
-            paged = unpacks.get(page_of(bits))
-            if paged is not None:
-                first, unpack = paged
-                chunks.append((first, unpack(bits)))
-        return chunks
+        bits = int.from_bytes(data[: message.length], "little")
+        parts = [self.parts[index] for index in message.in_frame(bits)]
+        return [(part.first, part.unpacker.values(bits)) for part in parts]
 
 
 _KEPT_VALUES = 2048
@@ -152,23 +152,37 @@ _TABLE_BITS = 8
 """Signals of at most this length are decoded with a table of all raw values."""
 
 
-def unpack_of(signals: Sequence[SignalPlan]) -> _Unpack:
-    """Return a function that decodes the signals from a frame's bits.
+class Unpacker:
+    """Decodes signals from a frame's bits. Bit 0 is bit 0 of byte 0."""
 
-    Bit 0 is bit 0 of byte 0.
-    """
-    rows = [_row(signal) for signal in signals]
-    lost = _conditions_of_lost_flags(signals)
+    def __init__(self, signals: Sequence[SignalPlan]) -> None:
+        self._rows = [_row(signal) for signal in signals]
+        self._lost = _conditions_of_lost_flags(signals)
 
-    def unpack(bits: int) -> list[Value]:
-        values = [value_of(bits >> at & mask) for at, mask, value_of in rows]
-        for flags, mask, codes in lost:
+    def values(self, bits: int) -> list[Value]:
+        """Return the values of all signals in one frame."""
+        values = [value_of(bits >> at & mask) for at, mask, value_of in self._rows]
+        for flags, mask, codes in self._lost:
             if bits & mask == codes:
                 for flag in flags:
                     values[flag] = None
         return values
 
-    return unpack
+    def column(self, index: int, frames: Sequence[int]) -> list[Value]:
+        """Return the values of one signal in many frames.
+
+        Its twin is ``values``, which takes three times as long for a recording
+        (tests/signals/test_unpacker_against_cantools.py).
+        """
+        at, mask, value_of = self._rows[index]
+        values = [*map(value_of, [bits >> at & mask for bits in frames])]
+        for flags, mask, codes in self._lost:
+            if index in flags:
+                values = [
+                    None if bits & mask == codes else value
+                    for bits, value in zip(frames, values, strict=True)
+                ]
+        return values
 
 
 def _row(signal: SignalPlan) -> tuple[int, int, Callable[[int], Value]]:

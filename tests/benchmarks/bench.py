@@ -25,6 +25,7 @@ BENCHMARKS = {
     "delay": live.delay,
     "delay-full": live.delay_full,
     "offline-capture": offline.captures,
+    "offline-log": offline.can_logs,
     "offline-bytes": offline.plain_bytes,
     "start": live.start,
     "memory": live.memory,

@@ -116,6 +116,41 @@ def captures(context: Context) -> list[Figure]:
     return figures
 
 
+def can_logs(context: Context) -> list[Figure]:
+    """An hour's candump log of one ESC as a table and as a page, compared with its capture."""
+    seconds = 60 if context.quick else 3600
+    source, log = capture(context, seconds), context.folder / f"log-{seconds}.log"
+    convert(context, "candump", source)
+    (context.folder / "converted.log").replace(log)
+    hours = seconds / 3600
+    tables = [convert(context, "csv", log) for _ in range(context.rounds)]
+    spent = median([one.cpu_s for one in tables]) / hours
+    pages = [(report(log), report(source)) for _ in range(context.rounds)]
+    page = median([of_log for of_log, _ in pages]) / hours
+    ratio = median([of_log / of_capture for of_log, of_capture in pages])
+    return [
+        Figure("candump log to csv, an hour", spent, "s", "<= 8", tables[0].written),
+        Figure("page of a candump log, an hour", page, "s", "<= 5"),
+        Figure("page of a candump log / of its capture", ratio, "x", "<= 4"),
+    ]
+
+
+def report(source: Path) -> float:
+    """CPU seconds for the page of a recording."""
+    from kontronik_can_gw.desk.recordings.inputs import open_input
+    from kontronik_can_gw.desk.report.flight import Flight, needed_columns
+    from kontronik_can_gw.desk.report.page import render
+
+    begun = time.process_time()
+    with open_input(source) as recording:
+        chosen = needed_columns(recording.fields)
+        flight = Flight(recording.bus.escs, [recording.fields[index] for index in chosen])
+        for block in recording.blocks(chosen):
+            flight.take(block)
+        render(flight.finish(), source=source.name, damage=recording.damage)
+    return time.process_time() - begun
+
+
 def plain_bytes(context: Context) -> list[Figure]:
     """UART bytes at full speed, MB a CPU second: the deframer alone, conversions; the quickest of the rounds."""
     source = context.folder / "bytes.bin"

@@ -1,6 +1,7 @@
-"""A whole gateway with CANopen nodes whose time is turned by hand: for tests in Python, and for dialogues (dialogues/README.md).
+"""A whole gateway with CANopen nodes, for tests in Python and for dialogues.
 
-Time passes by ``advance`` at each ``next_deadline``. Nothing but what is written or taken may be sent.
+The test sets the time, and ``advance`` runs at each ``next_deadline``. Only frames that a dialogue
+expects or a test takes may be sent. dialogues/README.md has the format of dialogues.
 """
 
 import ast
@@ -39,7 +40,8 @@ OFF = 0xC0000000
 FLAGS = ("extended", "fd", "remote")
 
 Changes = Mapping[tuple[int, int], Mapping[str, Any]]
-_SAVE, _LOAD = b"save", b"load"
+_SAVE = b"save"
+_LOAD = b"load"
 
 
 @cache
@@ -48,49 +50,53 @@ def shipped_eds() -> Eds:
 
 
 def changed(eds: Eds, changes: Changes) -> Eds:
-    """The EDS with other attributes of some entries, as after an EDS editor."""
+    """Return the EDS with other attributes of some entries, as an EDS editor may write it."""
     entries = [replace(e, **changes.get((e.index, e.sub), {})) for e in eds.entries]
     return replace(eds, entries=tuple(entries))
 
 
-def default(index: int, sub: int, value: float | bytes, relative: bool | None = None) -> Changes:
-    """One changed default."""
-    entry = next(e for e in shipped_eds().entries if (e.index, e.sub) == (index, sub))
-    return {
-        (index, sub): {
-            "default": value,
-            "relative": entry.relative if relative is None else relative,
-        }
-    }
+def default(
+    index: int,
+    sub: int,
+    value: float | bytes,
+    relative: bool | None = None,
+) -> Changes:
+    """Return the change of one default."""
+    if relative is None:
+        (entry,) = (e for e in shipped_eds().entries if (e.index, e.sub) == (index, sub))
+        relative = entry.relative
+    return {(index, sub): {"default": value, "relative": relative}}
 
 
 NO_HEARTBEAT = default(0x1017, 0, 0)
 NO_PDOS: Changes = {(0x1800 + n, 1): {"default": OFF, "relative": False} for n in range(6)}
 SPARE: Changes = {
-    (index, sub): {"default": value}
-    for n in (4, 5)
-    for index, sub, value in ((0x1A00 + n, 0, 1), (0x1A00 + n, 1, 0x20000210))
+    (0x1A04, 0): {"default": 1},
+    (0x1A04, 1): {"default": 0x20000210},
+    (0x1A05, 0): {"default": 1},
+    (0x1A05, 1): {"default": 0x20000210},
 }
-"""The two spare PDOs with battery voltage mapped, so that they need only a COB-ID to exist."""
+"""The two spare PDOs with battery voltage mapped, so that they only need a COB-ID to exist."""
 QUIET: Changes = {**NO_HEARTBEAT, **NO_PDOS}
-"""Changes that leave only frames that are asked for, and EMCY."""
+"""Changes after which nodes send only requested frames and EMCY."""
 
 
 def live(**fields: int) -> bytes:
-    """A live frame of the V4 layout. Fields not named are 0."""
+    """Return a live frame of the V4 layout. Fields that are not given are 0."""
     return codec.encode(LiveData(**fields), codec.Layout.V4)
 
 
 def info(**fields: int) -> bytes:
-    """An info frame of the V4 layout."""
+    """Return an info frame of the V4 layout."""
     return codec.encode(InfoData(**fields), codec.Layout.V4)
 
 
 class Bench(Talker):
-    """A gateway with ``nodes`` ESCs and nodes, node-IDs 1, 2, … and serial numbers 77, 78, …, whose time is turned by hand.
+    """A gateway with ``nodes`` ESCs and nodes. The test sets the time.
 
-    ``changes`` are made to the shipped EDS. ``settings`` are further fields of every NodeSettings, ``escs`` those of EscSettings, or
-    the ESCs themselves.
+    The node-IDs are 1, 2, … and the serial numbers 77, 78, and so on. ``changes`` are made to the
+    shipped EDS. ``settings`` are further fields of every NodeSettings. ``escs`` has further fields
+    of every EscSettings, or is a list of EscSettings.
     """
 
     def __init__(
@@ -113,11 +119,19 @@ class Bench(Talker):
         base = tuple(escs)
         node_ids = node_ids or range(1, len(base) + 1)
         self._arguments = dict(
-            changes=changes, eds=eds, node_ids=node_ids, layout=layout, escs=escs, **settings
+            changes=changes,
+            eds=eds,
+            node_ids=node_ids,
+            layout=layout,
+            escs=escs,
+            **settings,
         )
+        node_settings = []
+        for serial, node_id in enumerate(node_ids, 77):
+            node_settings.append(NodeSettings(node_id, serial=serial, **settings))
         self.setup = CanopenSetup(
             changed(eds or shipped_eds(), changes or {}),
-            tuple(NodeSettings(i, serial=77 + n, **settings) for n, i in enumerate(node_ids)),
+            tuple(node_settings),
             tuple(stored or [Stored()] * len(node_ids)),
             base,
         )
@@ -125,7 +139,7 @@ class Bench(Talker):
         self.on_disk = list(self.setup.stored)
         self.now = 0
         self.heard: list[tuple[int, CanFrame]] = []
-        """What was sent and not looked at yet, with its time."""
+        """Frames that were sent and not taken yet, with their times."""
         self.gateway.start(0)
         self._collect()
         if boot:
@@ -142,15 +156,18 @@ class Bench(Talker):
         return self.output.nodes
 
     def restart(self) -> None:
-        """The program ends and starts again with what is on disk; time begins anew."""
+        """End the program and start it with the data on disk. The time begins at 0 again."""
         self.__init__(**self._arguments, stored=self.on_disk)  # type: ignore[misc]
 
     # --- step by step
 
     def pass_time(self, until: int) -> None:
-        """Let time pass, ns."""
-        while (due := max(self.now, self.gateway.next_deadline())) <= until:
+        """Let time pass until this time in ns."""
+        while True:
             before = self.gateway.next_deadline()
+            due = max(self.now, before)
+            if due > until:
+                break
             self.now = due
             self.gateway.advance(due)
             self._collect()
@@ -161,30 +178,31 @@ class Bench(Talker):
         self.pass_time(self.now + round(ms * MS))
 
     def put(self, can_id: int, data: bytes | str, **flags: bool) -> None:
-        """A frame from the bus."""
+        """Receive a frame from the bus."""
         if isinstance(data, str):
             data = bytes.fromhex(data)
         self.gateway.receive_frame(CanFrame(can_id, data, **flags), self.now, self.now)
         self._collect()
 
     def uart(self, frame: bytes, esc: int = 0) -> None:
-        """Bytes from an ESC."""
+        """Receive bytes from an ESC."""
         self.gateway.receive_bytes(esc, frame, self.now, self.now)
         self._collect()
 
     def start(self, node: int = 0) -> "Bench":
-        """NMT start; what it causes is left out."""
+        """Send NMT start, and discard the frames that it causes."""
         self.put(0, bytes((1, node)))
         self.take()
         return self
 
     def take(self) -> list[CanFrame]:
-        """What was sent since the last call."""
-        heard, self.heard = self.heard, []
+        """Return the frames that were sent since the last call."""
+        heard = self.heard
+        self.heard = []
         return [frame for _, frame in heard]
 
     def answer_saves(self, error: str | None = None) -> list[tuple[int, Stored]]:
-        """Store what waits to be stored, or let it fail."""
+        """Store the waiting parameters, or let storing fail with an error."""
         saves = self.gateway.take_saves()
         stored = [(esc, decode(content)) for esc, content in saves]
         for esc, parameters in stored:
@@ -200,21 +218,34 @@ class Bench(Talker):
     # --- SDO
 
     def ask(self, node: int, request: bytes) -> bytes:
-        """One request and its one answer."""
+        """Send a request and return its only answer."""
         self.put(0x600 + node, request)
         return self._answer(node)
 
-    def read(self, index: int, sub: int = 0, node: int = 1) -> bytes | int:
-        """The data of an upload, or its abort code."""
+    def read(
+        self,
+        index: int,
+        sub: int = 0,
+        node: int = 1,
+    ) -> bytes | int:
+        """Return the data of an upload, or its abort code."""
         try:
             return upload(partial(self.ask, node), index, sub)
         except Refused as refused:
             return refused.code
 
     def write(
-        self, index: int, sub: int, data: bytes | int, node: int = 1, size: int = 4
+        self,
+        index: int,
+        sub: int,
+        data: bytes | int,
+        node: int = 1,
+        size: int = 4,
     ) -> int | None:
-        """The abort code of a download, None where it is confirmed. What is to be stored is stored at once."""
+        """Download data. Return None if it is confirmed, or its abort code.
+
+        Parameters to be stored are stored immediately.
+        """
         if isinstance(data, int):
             data = data.to_bytes(size, "little", signed=data < 0)
         try:
@@ -223,8 +254,13 @@ class Bench(Talker):
             return refused.code
         return None
 
-    def number(self, index: int, sub: int = 0, node: int = 1) -> int:
-        """An upload as an unsigned number."""
+    def number(
+        self,
+        index: int,
+        sub: int = 0,
+        node: int = 1,
+    ) -> int:
+        """Return the data of an upload as an unsigned number."""
         data = self.read(index, sub, node)
         assert isinstance(data, bytes), f"{index:04X}h:{sub:02X}: {data:08X}h"
         return int.from_bytes(data, "little")
@@ -236,21 +272,27 @@ class Bench(Talker):
         return self._answer(node)
 
     def _answer(self, node: int) -> bytes:
-        """The one SDO answer that a node has given."""
-        answers = [f for _, f in self.heard if f.can_id == 0x580 + node]
-        self.heard = [(t, f) for t, f in self.heard if f.can_id != 0x580 + node]
+        """Return the only SDO answer of a node."""
+        answers = []
+        others = []
+        for time, frame in self.heard:
+            if frame.can_id == 0x580 + node:
+                answers.append(frame)
+            else:
+                others.append((time, frame))
+        self.heard = others
         assert len(answers) == 1, f"{len(answers)} answers of node {node}"
         return answers[0].data
 
     # --- dialogues (script.Talker)
 
     def jump(self, now: int) -> None:
-        """Let time pass without being served: the program hung."""
+        """Let time pass without serving deadlines, as if the program hung."""
         self.now = now
         self.gateway.advance(now)
 
     def say(self, what: str) -> str:
-        """Do what a line says. The line as it should read: another one where an answer or a state is not as expected."""
+        """Execute a line. Return the line with the actual answer or state."""
         verb, _, rest = what.partition(" ")
         match verb, rest.split():
             case "<-", [cob_id, *data]:
@@ -262,10 +304,12 @@ class Bench(Talker):
             case "uart", [esc, "wrong", "CRC"]:
                 self.uart(live()[:-1] + b"\xff", int(esc))
             case "uart", [esc, kind, *fields]:
-                values = {
-                    name: int(value, 0) for name, value in (field.split("=") for field in fields)
-                }
-                self.uart((live if kind == "live" else info)(**values), int(esc))
+                values = {}
+                for field in fields:
+                    name, value = field.split("=")
+                    values[name] = int(value, 0)
+                make = live if kind == "live" else info
+                self.uart(make(**values), int(esc))
             case (("read" | "write"), _):
                 return self._say_sdo(verb, rest)
             case "port", ["lost", esc]:
@@ -289,18 +333,20 @@ class Bench(Talker):
                 else:
                     self.answer_saves(error)
             case "stored", [node, *_]:
-                return f"stored {node} {_stored_text(self.on_disk[int(node) - 1])}".rstrip()
+                text = _stored_text(self.on_disk[int(node) - 1])
+                return f"stored {node} {text}".rstrip()
             case "restart", []:
                 self.restart()
             case "state", [node, _]:
                 return f"state {node} {self.nodes[int(node) - 1].state:02X}"
             case "listens", _:
-                listened_to = sorted(self.output.receive_ids)
-                return f"listens {' '.join(f'{cob_id:03X}' for cob_id in listened_to)}"
+                cob_ids = [f"{cob_id:03X}" for cob_id in sorted(self.output.receive_ids)]
+                return f"listens {' '.join(cob_ids)}"
             case "slave", _:
                 return f"slave {'configuration' if self.nodes[0].lss.configuring else 'waiting'}"
             case "node-id", _:
-                return f"node-id {self.nodes[0].node_id} {self.nodes[0].identity.pending_node_id}"
+                first = self.nodes[0]
+                return f"node-id {first.node_id} {first.identity.pending_node_id}"
             case "reset", []:
                 self.nodes[0].lss.reset()
             case "rejected", [node, *_]:
@@ -313,41 +359,48 @@ class Bench(Talker):
     def _say_sdo(self, verb: str, rest: str) -> str:
         match = re.fullmatch(r"(\d+) (\w{4}:\w\w)((?: [0-9A-F]{2})*)(?: [=!].*)?", rest)
         assert match is not None, f"what is {rest!r}?"
-        node, place, data = int(match[1]), _place(match[2]), bytes.fromhex(match[3])
-        said = f"{verb} {node} {match[2]} {hexadecimal(data)}".rstrip()
-        found = self.read(*place, node) if verb == "read" else self.write(*place, data, node)
+        node = int(match[1])
+        place = _place(match[2])
+        data = bytes.fromhex(match[3])
+        line = f"{verb} {node} {match[2]} {hexadecimal(data)}".rstrip()
+        if verb == "read":
+            found = self.read(*place, node)
+        else:
+            result = self.write(*place, data, node)
+            if result is None:
+                return line
+            found = result
         if isinstance(found, int):
-            return f"{said} ! {found:08X}"
-        return said if found is None else f"{said} = {hexadecimal(found)}".rstrip()
+            return f"{line} ! {found:08X}"
+        return f"{line} = {hexadecimal(found)}".rstrip()
 
     def _collect(self) -> None:
         self.heard += [(self.now, frame) for frame in self.gateway.take_frames(self.now)]
 
     def heard_lines(self) -> list[str]:
-        """What was sent since the last call, as lines."""
+        """Return the frames that were sent since the last call, as lines."""
         self._collect()
         lines = []
         for time, frame in self.heard:
             flags = "".join(f" {name}" for name in FLAGS if getattr(frame, name))
-            lines.append(
-                f"{ms(time)} -> {frame.can_id:03X} {hexadecimal(frame.data)}{flags}".rstrip()
-            )
+            text = f"{frame.can_id:03X} {hexadecimal(frame.data)}{flags}"
+            lines.append(f"{ms(time)} -> {text}".rstrip())
         self.heard = []
         return lines
 
 
 def _name(number: int) -> str:
-    """``1017:00``."""
+    """Return the name of an object, for example ``1017:00``."""
     return f"{number >> 8:04X}:{number & 0xFF:02X}"
 
 
 def _place(name: str) -> tuple[int, int]:
-    """Index and sub-index of ``1017:00``."""
+    """Return index and sub-index of a name such as ``1017:00``."""
     return int(name[:4], 16), int(name[5:], 16)
 
 
 def _stored_text(stored: Stored) -> str:
-    """``node-id 7 1017:00=F401 2100:01=05``."""
+    """Return stored data as text, for example ``node-id 7 1017:00=F401 2100:01=05``."""
     values = sorted({**stored.communication, **stored.application}.items())
     texts = [f"{_name(number)}={data.hex().upper()}" for number, data in values]
     node_id = [] if stored.node_id is None else ["node-id", str(stored.node_id)]
@@ -355,17 +408,22 @@ def _stored_text(stored: Stored) -> str:
 
 
 def _stored(words: Sequence[str]) -> Stored:
-    node_id = int(words[1]) if words[:1] == ["node-id"] else None
-    kept: tuple[dict[int, bytes], dict[int, bytes]] = ({}, {})
-    for word in words[2:] if words[:1] == ["node-id"] else words:
+    node_id = None
+    if words[:1] == ["node-id"]:
+        node_id = int(words[1])
+        words = words[2:]
+    communication: dict[int, bytes] = {}
+    application: dict[int, bytes] = {}
+    for word in words:
         name, _, data = word.partition("=")
         index, sub = _place(name)
-        kept[index >= 0x2000][index << 8 | sub] = bytes.fromhex(data)
-    return Stored(node_id, *kept)
+        kept = application if index >= 0x2000 else communication
+        kept[index << 8 | sub] = bytes.fromhex(data)
+    return Stored(node_id, communication, application)
 
 
 def bench_of(options: Sequence[str]) -> Bench:
-    """A bench with the options of a dialogue (see ``dialogues/README.md``)."""
+    """Return a bench with the options of a dialogue (see ``dialogues/README.md``)."""
     changes: dict[tuple[int, int], Any] = {}
     arguments: dict[str, Any] = {}
     kept: Changes = QUIET
@@ -430,7 +488,7 @@ def bench_of(options: Sequence[str]) -> Bench:
 
 
 def _attribute(text: str) -> Any:
-    """A number, bytes, "yes" or "none", else a word."""
+    """Return the value of a text: True for "yes", None for "none", a number, bytes or a word."""
     if text in ("yes", "none"):
         return True if text == "yes" else None
     try:
@@ -439,12 +497,22 @@ def _attribute(text: str) -> Any:
         return text
 
 
-def tpdo(number: int, kind: int = 254, inhibit: int = 0, timer: int = 0, *mapped: int) -> Changes:
-    """A TPDO with its shipped COB-ID, mapped to battery voltage where nothing is named."""
+def tpdo(
+    number: int,
+    kind: int = 254,
+    inhibit: int = 0,
+    timer: int = 0,
+    *mapped: int,
+) -> Changes:
+    """Return the changes for a TPDO with its shipped COB-ID, by default of the battery voltage."""
     mapped = mapped or (0x20000210,)
     index = 0x1800 + number - 1
     values = {(index, 2): kind, (index, 3): inhibit, (index, 5): timer}
-    values |= {(index + 0x200, n): entry for n, entry in enumerate((len(mapped), *mapped))}
-    changes: dict[tuple[int, int], Any] = {at: {"default": value} for at, value in values.items()}
+    values[index + 0x200, 0] = len(mapped)
+    for sub, entry in enumerate(mapped, 1):
+        values[index + 0x200, sub] = entry
+    changes: dict[tuple[int, int], Any] = {}
+    for place, value in values.items():
+        changes[place] = {"default": value}
     changes[index, 1] = {"default": 0x40000080 + 0x100 * number, "relative": True}
     return changes

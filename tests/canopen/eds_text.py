@@ -1,4 +1,4 @@
-"""The shipped EDS as text, and with other keys or further objects, as an EDS editor leaves it."""
+"""The shipped EDS as text, also with changed keys or further objects, as EDS editors write it."""
 
 import re
 import subprocess
@@ -11,7 +11,7 @@ SHIPPED = shipped("eds/kontronik_esc.eds").read_bytes().decode("ascii")
 
 
 def with_key(source: str, section: str, key: str, value: str) -> str:
-    """The text with another value of a key, or with the key."""
+    """Return the text with a key set to this value. A missing key is added."""
     start = source.index(f"[{section}]")
     end = source.find("\r\n[", start)
     part = source[start : end if end >= 0 else None]
@@ -21,8 +21,13 @@ def with_key(source: str, section: str, key: str, value: str) -> str:
     return source.replace(part, changed)
 
 
-def variable(data_type: int, access: str = "rw", name: str = "Test object", **keys: object) -> str:
-    """The content of a section of a VAR."""
+def variable(
+    data_type: int,
+    access: str = "rw",
+    name: str = "Test object",
+    **keys: object,
+) -> str:
+    """Return the content of the section of a VAR."""
     values = {
         "ParameterName": name,
         "ObjectType": "0x7",
@@ -34,15 +39,20 @@ def variable(data_type: int, access: str = "rw", name: str = "Test object", **ke
 
 
 def with_object(source: str, index: int, content: str) -> str:
-    """The text with one more manufacturer object, of which ``content`` is the section's."""
-    count = int(re.search(r"\[ManufacturerObjects\]\r\nSupportedObjects=(\d+)", source)[1])  # type: ignore[index]
+    """Return the text with a further manufacturer object, whose section has this content."""
+    found = re.search(r"\[ManufacturerObjects\]\r\nSupportedObjects=(\d+)", source)
+    assert found is not None
+    count = int(found[1])
     source = with_key(source, "ManufacturerObjects", "SupportedObjects", str(count + 1))
     source = with_key(source, "ManufacturerObjects", str(count + 1), f"0x{index:04X}")
     return f"{source.rstrip()}\r\n\r\n[{index:04X}]\r\n{content}\r\n"
 
 
 def dcfchk(file: Path, node_id: int) -> str:
-    """What dcf-tools' checker of CiA 306 finds; empty for nothing. Without a node-ID it cannot take $NODEID."""
+    """Return the findings of dcf-tools' checker of CiA 306, or "".
+
+    Without a node-ID the checker does not accept $NODEID.
+    """
     program = "from dcf.cli import main; main()"
     command = [sys.executable, "-c", program, "-p", "-n", str(node_id), str(file)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)

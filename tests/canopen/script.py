@@ -1,4 +1,4 @@
-"""Dialogues in files: reading them, and playing them with a talker. The format is in dialogues/README.md."""
+"""Reads dialogues from files and plays them with a talker. dialogues/README.md has the format."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,11 +9,11 @@ from pathlib import Path
 
 MS = 1_000_000
 Line = tuple[str, str]
-"""Where a line of a dialogue stands, and the line."""
+"""The place of a line of a dialogue, and the line."""
 
 
 class Talker:
-    """What dialogues are played with."""
+    """The partner of a dialogue, which executes its lines."""
 
     now = 0
 
@@ -21,15 +21,15 @@ class Talker:
         self._lines: list[str] = []
 
     def pass_time(self, until: int) -> None:
-        """Let time pass, ns, serving each deadline."""
+        """Let time pass until this time in ns. Serve each deadline."""
         self.now = until
 
     def jump(self, now: int) -> None:
-        """Let time pass and serve what is due once, at its end."""
+        """Let time pass until this time in ns. Serve the deadlines only once, at its end."""
         self.now = now
 
     def say(self, what: str) -> str:
-        """Do what a line says; the line with what really is in place of what is expected."""
+        """Execute a line. Return the line with the actual values instead of the expected ones."""
         raise NotImplementedError
 
     def hear(self, now: int, frame: str) -> None:
@@ -37,14 +37,15 @@ class Talker:
         self._lines.append(f"{ms(now)} -> {frame}".rstrip())
 
     def heard_lines(self) -> list[str]:
-        """What was sent since the last call, "time -> ...": lines."""
-        lines, self._lines = self._lines, []
+        """Return the lines "time -> ..." of the frames that were sent since the last call."""
+        lines = self._lines
+        self._lines = []
         return lines
 
 
 @dataclass
 class Dialogue:
-    """One dialogue of a file: its name, options, and lines with their places."""
+    """One dialogue of a file: its name, its options, and its lines with their places."""
 
     name: str
     options: list[str]
@@ -52,7 +53,7 @@ class Dialogue:
 
 
 def read_dialogues(path: Path) -> list[Dialogue]:
-    """All dialogues of a file, tables worked in."""
+    """Return all dialogues of a file. A table gives a dialogue for each row."""
     blocks: list[tuple[str, list[Line]]] = [("", [])]
     for number, raw in enumerate(path.read_text("utf-8").splitlines(), 1):
         line = raw.partition(";")[0].strip()
@@ -60,7 +61,9 @@ def read_dialogues(path: Path) -> list[Dialogue]:
             blocks.append((line[2:].strip(), []))
         elif line:
             blocks[-1][1].append((f"{path.name}:{number}", line))
-    head, texts, parts = [], {}, dict[str, list[Line]]()
+    head = []
+    texts = {}
+    parts = dict[str, list[Line]]()
     for place, line in blocks.pop(0)[1]:
         verb, _, rest = line.partition(" ")
         if verb == "with":
@@ -74,12 +77,14 @@ def read_dialogues(path: Path) -> list[Dialogue]:
             list(parts.values())[-1].append((place, line))
     found = []
     for title, block in blocks:
-        rows = [
-            tuple(cell.strip() for cell in line.split("|")[1:])
-            for _, line in block
-            if line.startswith(("each", "|"))
-        ]
-        names, values = (rows[0], rows[1:]) if rows else ((), [()])
+        rows: list[tuple[str, ...]] = []
+        for _, line in block:
+            if line.startswith(("each", "|")):
+                rows.append(tuple(cell.strip() for cell in line.split("|")[1:]))
+        if not rows:
+            rows = [(), ()]
+        names = rows[0]
+        values = rows[1:]
         lines = []
         for place, line in block:
             verb, _, rest = line.partition(" ")
@@ -89,15 +94,17 @@ def read_dialogues(path: Path) -> list[Dialogue]:
                 lines.append((place, line))
         for row in values:
             row_texts = {**texts, **dict(zip(names, row, strict=True))}
-            filled = [(place, text) for place, line in lines if (text := _filled(line, row_texts))]
-            found.append(
-                Dialogue(
-                    f"{path.stem}: {title}" + (f" [{', '.join(row)}]" if row else ""),
-                    head
-                    + [line.partition(" ")[2] for _, line in filled if line.startswith("with ")],
-                    [(place, line) for place, line in filled if not line.startswith("with ")],
-                )
-            )
+            name = f"{path.stem}: {title}"
+            if row:
+                name += f" [{', '.join(row)}]"
+            dialogue = Dialogue(name, list(head), [])
+            for place, line in lines:
+                text = _filled(line, row_texts)
+                if text.startswith("with "):
+                    dialogue.options.append(text.partition(" ")[2])
+                elif text:
+                    dialogue.lines.append((place, text))
+            found.append(dialogue)
     return found
 
 
@@ -106,15 +113,20 @@ def _filled(line: str, texts: Mapping[str, str]) -> str:
 
 
 def play_lines(talker: Talker, lines: Sequence[Line]) -> None:
-    """Say the lines at their times (none: that of the line before) and hear exactly what they expect, no more and no other."""
+    """Execute the lines at their times, and compare all sent frames with the expected ones.
+
+    A line without a time has the time of the line before it.
+    """
     expected: list[Line] = []
     actual: list[str] = []
     time = ms(talker.now)
     for place, raw in lines:
-        match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)\s+)?(\S.*)", raw.partition(";")[0].strip())
+        line = raw.partition(";")[0].strip()
+        match = re.fullmatch(r"(?:(\d+(?:\.\d+)?)\s+)?(\S.*)", line)
         if match is None:
             continue
-        time, what = match[1] or time, " ".join(match[2].split())
+        time = match[1] or time
+        what = " ".join(match[2].split())
         now = round(float(time) * MS)
         if what == "hung":
             talker.jump(now)
@@ -131,26 +143,34 @@ def play_lines(talker: Talker, lines: Sequence[Line]) -> None:
         actual.append(f"{float(time):g} {talker.say(what)}")
         time = ms(talker.now)  # a restart begins with 0
         actual += talker.heard_lines()
+    _compare(expected, actual)
+
+
+def _compare(expected: Sequence[Line], actual: Sequence[str]) -> None:
+    """Raise AssertionError with the first line that differs."""
     wanted = [_padded(line) for _, line in expected]
     got = [_with_wildcards(*pair) for pair in zip(actual, wanted, strict=False)]
     got += actual[len(wanted) :]
     pairs = zip_longest(wanted, got, fillvalue="nothing")
-    for at, (line, other) in enumerate(pairs):
+    for number, (line, other) in enumerate(pairs):
         if line != other:
             last = expected[-1][0] if expected else "the begin"
-            place = expected[at][0] if at < len(expected) else f"after {last}"
+            place = expected[number][0] if number < len(expected) else f"after {last}"
             diff = "\n".join(ndiff(wanted, got))
             text = f"expected {line!r}, got {other!r}; expected (-), got (+):\n{diff}"
             raise AssertionError(f"{place}: {text}")
 
 
 def bytes_of(text: str) -> bytes:
-    """Bytes in hexadecimal; ``00*`` at the end: zeros up to the eighth."""
-    return bytes.fromhex(text.removesuffix("00*")).ljust(8 if text.endswith("00*") else 0, b"\0")
+    """Return bytes of hexadecimal text. ``00*`` at the end means zeros up to the eighth byte."""
+    data = bytes.fromhex(text.removesuffix("00*"))
+    if text.endswith("00*"):
+        data = data.ljust(8, b"\0")
+    return data
 
 
 def _padded(line: str) -> str:
-    """An expected frame with its ``00*`` written out."""
+    """Return an expected frame with ``00*`` replaced by zeros."""
     time, arrow, *words = line.split()
     if arrow != "->" or words[-1:] != ["00*"]:
         return line
@@ -159,7 +179,9 @@ def _padded(line: str) -> str:
 
 
 def ms(time: int) -> str:
-    return f"{round(time / MS, 3):g}" if time < 100_000 * MS else f"{time // MS}"
+    if time >= 100_000 * MS:
+        return f"{time // MS}"
+    return f"{round(time / MS, 3):g}"
 
 
 def hexadecimal(data: bytes) -> str:
@@ -167,8 +189,12 @@ def hexadecimal(data: bytes) -> str:
 
 
 def _with_wildcards(was: str, wanted: str) -> str:
-    """``was`` with ".." where ``wanted`` has it, and without the answer that a line does not ask for."""
-    one, other = was.split(), wanted.split()
-    if len(one) != len(other) or ".." not in other:
+    """Return ``was`` with each word replaced by ".." that is ".." in ``wanted``."""
+    actual = was.split()
+    expected = wanted.split()
+    if len(actual) != len(expected) or ".." not in expected:
         return was
-    return " ".join(".." if b == ".." else a for a, b in zip(one, other, strict=True))
+    words = []
+    for word, pattern in zip(actual, expected, strict=True):
+        words.append(".." if pattern == ".." else word)
+    return " ".join(words)

@@ -1,4 +1,4 @@
-"""An SDO server over a small object dictionary, whose time is turned by hand, for the tests of the server."""
+"""An SDO server with a small object dictionary, for the tests of the server. The test sets time."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,12 @@ from kontronik_can_gw.canopen.eds import Eds, Entry
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.times import NEVER
 
-_U8, _U16, _U32, _TEXT, _DOMAIN, _U64 = 0x05, 0x06, 0x07, 0x09, 0x0F, 0x1B
+_U8 = 0x05
+_U16 = 0x06
+_U32 = 0x07
+_TEXT = 0x09
+_DOMAIN = 0x0F
+_U64 = 0x1B
 _ENTRIES: list[tuple[int, int, int, str, int | bytes]] = [
     (0x1000, 0, _U32, "ro", 0x00020192),
     (0x1001, 0, _U8, "ro", 5),
@@ -33,7 +38,10 @@ class _TenBytes(Variable):
 
 
 class Objects(Dictionary):
-    """Remembers what was written. 2004h holds 10 bytes, 2005h is confirmed later, 2006h is at most 100."""
+    """An object dictionary that records downloads.
+
+    2004h has at most 10 bytes, 2005h is confirmed later, and 2006h is at most 100.
+    """
 
     def __init__(self) -> None:
         entries = [
@@ -52,14 +60,14 @@ class Objects(Dictionary):
 
 
 class Bench(Talker):
-    """A server whose time is turned by hand; a talker of dialogues (see script.py)."""
+    """A server that is the talker of dialogues (see script.py). The test sets the time."""
 
     def __init__(self, segment_ns: int = 0) -> None:
         super().__init__()
         self.objects = Objects()
         self.server = SdoServer(self.objects, self._sent, segment_ns)
         self.answers: list[bytes] = []
-        """Those of the last request, and what followed it."""
+        """Answers to the last request, and the frames after them."""
         self._tickets: list[int] = []
 
     def _sent(self, data: bytes) -> None:
@@ -68,9 +76,9 @@ class Bench(Talker):
         self.hear(self.now, hexadecimal(data))
 
     def pass_time(self, until: int) -> None:
-        """Let time pass as the runtime does: from deadline to deadline."""
-        while (due := self.server.due) <= until:
-            self.now = max(self.now, due)
+        """Let time pass from deadline to deadline, as the runtime does."""
+        while self.server.due <= until:
+            self.now = max(self.now, self.server.due)
             self.server.advance(self.now)
             assert self.server.due > self.now, "a deadline that advance does not settle"
         self.now = until
@@ -80,7 +88,7 @@ class Bench(Talker):
         self.server.advance(now)
 
     def request(self, data: bytes) -> list[bytes]:
-        """One request now, and what is answered at once."""
+        """Send a request now. Return the immediate answers."""
         self.answers = []
         self.server.receive(data, self.now)
         if self.server.waiting is not None:
@@ -119,5 +127,6 @@ class Bench(Talker):
 
 
 def sdo_bench_of(options: Sequence[str]) -> Bench:
-    """``segment N``: pauses of a block upload, ms a segment."""
-    return Bench(sum(int(option.removeprefix("segment ")) for option in options) * MS)
+    """Return a bench. The option ``segment N`` sets the pause of a block upload in ms a segment."""
+    pause_ms = sum(int(option.removeprefix("segment ")) for option in options)
+    return Bench(pause_ms * MS)

@@ -1,4 +1,4 @@
-"""The DBC of the CANopen side: what it decodes from the nodes' own frames is what the telemetry says, in every tool."""
+"""The DBC of the CANopen side decodes the nodes' frames to the values of the telemetry."""
 
 import re
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ NA = "NotAvailable"
 
 
 def described(bench: dialogue.Bench) -> str:
-    """The DBC of the nodes as they are at this moment."""
+    """Return the DBC of the nodes in their present state."""
     settings = [esc.settings for esc in bench.gateway.escs]
     text = canopen_dbc.pdo_text(bench.output, settings)
     assert text.isascii()
@@ -55,7 +55,7 @@ def remap(
     node: int = 1,
     kind: int = 254,
 ) -> None:
-    """The procedure of CiA 301 for another mapping; ``objects`` as mapping entries."""
+    """Change a mapping by the procedure of CiA 301. ``objects`` are mapping entries."""
     writes = [(0x1800 + pdo, 1, 0xC0000000 | cob_id, 4), (0x1A00 + pdo, 0, 0, 1)]
     writes += [(0x1A00 + pdo, sub, entry, 4) for sub, entry in enumerate(objects, 1)]
     writes += [(0x1A00 + pdo, 0, len(objects), 1), (0x1800 + pdo, 2, kind, 1)]
@@ -65,7 +65,10 @@ def remap(
 
 
 class Bench(dialogue.Bench):
-    """A gateway with simulated ESCs on its lines; each frame is decoded at once and held against the telemetry of that moment."""
+    """A gateway with simulated ESCs.
+
+    Each frame is decoded immediately and compared with the telemetry of that moment.
+    """
 
     def __init__(
         self,
@@ -75,7 +78,7 @@ class Bench(dialogue.Bench):
     ) -> None:
         self.database = Database()
         self.seen: dict[str, list[dict[str, Any]]] = {}
-        """Message name to what was decoded, in order."""
+        """Decoded values of each message by its name, in order."""
         self.simulators = [
             SimulatedEsc(option, seed=n, start_ns=MS) for n, option in enumerate(simulated)
         ]
@@ -86,12 +89,12 @@ class Bench(dialogue.Bench):
             self.decode(frame)
 
     def run(self, until: int) -> None:
-        events = sorted(
-            (sent.time_ns + len(sent.wire) * BYTE_NS, n, sent.wire)
-            for n, simulator in enumerate(self.simulators)
-            for sent in simulator.frames_until(until)
-        )
-        for when, esc, wire in events:
+        events = []
+        for number, simulator in enumerate(self.simulators):
+            for sent in simulator.frames_until(until):
+                end = sent.time_ns + len(sent.wire) * BYTE_NS
+                events.append((end, number, sent.wire))
+        for when, esc, wire in sorted(events):
             self.pass_time(when)
             self.uart(wire, esc)
         self.pass_time(until)
@@ -109,7 +112,9 @@ class Bench(dialogue.Bench):
         message = self.database.get_message_by_frame_id(sent.can_id)
         assert len(sent.data) == message.length, message.name
         decoded: Any = message.decode(sent.data)
-        values = {k: str(v) if isinstance(v, NamedSignalValue) else v for k, v in decoded.items()}
+        values = {}
+        for name, value in decoded.items():
+            values[name] = str(value) if isinstance(value, NamedSignalValue) else value
         self.seen.setdefault(message.name, []).append(values)
         if "Tpdo" not in message.name:
             return
@@ -123,7 +128,7 @@ class Bench(dialogue.Bench):
             assert values[signal.name] == wanted, signal.name
 
     def expected(self, esc: EscTelemetry) -> dict[str, Any]:
-        """What each signal without prefix must show now, as the packers' oracle reckons it."""
+        """Return the expected value of each signal without prefix, by the packers' oracle."""
         found: dict[str, Any] = {}
         for name, known in KNOWN.items():
             value = known.read(esc, self.gateway.status, self.now)
@@ -131,9 +136,10 @@ class Bench(dialogue.Bench):
             found[pascal(name) + ("Percent" if known.unit == "%" else "")] = shown
         found |= {pascal(bit): int(found[pascal(bit)] != 0) for bit in ERROR_BITS}
         state = found["OperatingState"]
-        found["OperatingState"] = (
-            state.replace("_", "") if isinstance(state, str) else f"State{state}"
-        )
+        if isinstance(state, str):
+            found["OperatingState"] = state.replace("_", "")
+        else:
+            found["OperatingState"] = f"State{state}"
         found |= {"Replay": 0, "InfoValid": int(esc.info is not None)}
         found["LiveCounter"] = esc.counters.live % 256
         found["VelocityActualValue"] = found["MotorSpeed"]
@@ -141,20 +147,20 @@ class Bench(dialogue.Bench):
         return found
 
 
-# --- the shipped file -------------------------------------------------------------------------------------------------
+# --- the shipped file
 
 
-def test_the_shipped_file_is_what_the_command_writes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_the_shipped_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["dbc", "--canopen"]) == 0
     assert capsys.readouterr().out == SHIPPED.read_text()
     assert copies_text(read(SHIPPED.read_text())) == SHIPPED.read_text(), "it can be written again"
 
 
-# --- decoding what nodes send --------------------------------------------------------------------------------------------
+# --- decoding the nodes' frames
 
 
 def test_every_frame_of_running_nodes_decodes_to_the_telemetry() -> None:
-    """Two ESCs: one with errors and a loss of telemetry, and a JIVEPRO, which supplies no BEC current."""
+    """One ESC has errors and a loss of telemetry. The other is a JIVEPRO without BEC current."""
     hot = OperatingError.POWER_STAGE_OVERTEMP_WARNING
     errors = (
         ErrorWindow(OperatingError.UNDERVOLTAGE, SECOND, SECOND),
@@ -167,14 +173,19 @@ def test_every_frame_of_running_nodes_decodes_to_the_telemetry() -> None:
     bench.run(9 * SECOND)
     count = {name: len(values) for name, values in bench.seen.items()}
     assert set(count) == {message.name for message in bench.database.messages} - {"RightREmergency"}
-    assert count["RightRTpdo1"] > 300 and count["RightRTpdo2"] > 100 and count["RightRTpdo3"] > 60
+    assert count["RightRTpdo1"] > 300
+    assert count["RightRTpdo2"] > 100
+    assert count["RightRTpdo3"] > 60
     ids = {message.name: message.frame_id for message in bench.database.messages}
-    assert (ids["LeftTpdo1"], ids["RightRHeartbeat"], ids["LeftEmergency"]) == (0x185, 0x709, 0x85)
+    assert ids["LeftTpdo1"] == 0x185
+    assert ids["RightRHeartbeat"] == 0x709
+    assert ids["LeftEmergency"] == 0x85
     assert "node 5 (left), node 9 (right_r)" in str(bench.database.buses[0].comment)
     states = [values["LeftNodeState"] for values in bench.seen["LeftHeartbeat"]]
     assert states == ["BootUp", *["Operational"] * 9]
     emergencies = bench.seen["LeftEmergency"]
-    assert [(each["LeftEmergencyCode"], each["LeftEmergencySource"]) for each in emergencies] == [
+    codes = [(each["LeftEmergencyCode"], each["LeftEmergencySource"]) for each in emergencies]
+    assert codes == [
         ("Undervoltage", "Undervoltage"),
         ("NoError", "Gateway"),
         (pascal(hot.name), pascal(hot.name)),
@@ -186,14 +197,16 @@ def test_every_frame_of_running_nodes_decodes_to_the_telemetry() -> None:
     register = {name for name in first if "ErrorRegister" in name and first[name]}
     assert register == {"LeftErrorRegisterGeneric", "LeftErrorRegisterVoltage"}
     seen = [values["LeftLinkState"] for values in bench.seen["LeftTpdo4"]]
-    assert seen[0] == "NeverSeen" and "Lost" in seen and seen[-1] in ("Ok", "Degraded")
+    assert seen[0] == "NeverSeen"
+    assert "Lost" in seen
+    assert seen[-1] in ("Ok", "Degraded")
     seen = [values["RightROperatingState"] for values in bench.seen["RightRTpdo4"]]
     assert {"MotorOff", "SpoolUpFromStill"} <= set(seen)
     assert bench.seen["RightRTpdo3"][-1]["RightRBecCurrent"] == NA
     assert bench.seen["LeftTpdo3"][-1]["LeftBecCurrent"] != NA
 
 
-# --- other mappings ------------------------------------------------------------------------------------------------------
+# --- other mappings
 
 
 def delay(message: Any) -> int:
@@ -201,7 +214,7 @@ def delay(message: Any) -> int:
     return 0 if found is None else found.value
 
 
-def test_timing_of_what_is_sent_at_syncs_and_not_at_all() -> None:
+def test_the_dbc_has_the_timing_of_pdos_at_syncs_and_disabled_messages() -> None:
     bench = dialogue.Bench()
     remap(bench, 0, 0x181, [0x20000120], kind=3)
     remap(bench, 1, 0x281, [0x20000410], kind=0)
@@ -235,7 +248,7 @@ PLAIN = [
 ]
 
 
-def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() -> None:
+def test_a_storage_object_of_any_eds_is_a_raw_signal_with_its_name() -> None:
     text = EDS_TEXT
     for number, (name, kind, value, *_) in enumerate(PLAIN):
         content = variable(kind, name=name, DefaultValue=value, PDOMapping=1)
@@ -260,14 +273,12 @@ def test_plain_storage_of_any_eds_is_a_raw_signal_with_the_name_of_the_object() 
     assert "VAL_ 641" not in text
 
 
-def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
+def test_names_that_are_too_long_are_cut_and_remain_unique() -> None:
     escs = [EscSettings("port_outer_1"), EscSettings("port_outer_2")]
     text = described(dialogue.Bench(escs=escs))
     db = read(text)
-    messages, signals = (
-        [m.name for m in db.messages],
-        [s.name for m in db.messages for s in m.signals],
-    )
+    messages = [m.name for m in db.messages]
+    signals = [s.name for m in db.messages for s in m.signals]
     for names in (messages, signals):
         assert len({name.lower() for name in names}) == len(names)
     check_comments(db)
@@ -277,8 +288,9 @@ def test_names_too_long_for_tools_are_cut_and_stay_unique() -> None:
     assert "PortOuter1LimitBatteryVoltageMin" in names
 
 
-def test_a_node_that_waits_for_lss_has_no_frames_and_is_warned_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_node_that_waits_for_lss_has_no_frames_and_causes_a_warning(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     file = tmp_path / "gateway.toml"
     esc = '[[esc]]\nname = "{}"\nport = "/dev/tty{}"\n'

@@ -1,4 +1,7 @@
-"""Dialogues from files with CANopen nodes and the SDO server alone. The format: dialogues/README.md."""
+"""Plays the dialogues of files with CANopen nodes, or with the SDO server alone.
+
+dialogues/README.md has the format.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""A walk by SDO over the whole index space: size, access and limits of each object, and the values of 2000h in each state of the link."""
+"""Reads and writes the whole index space by SDO.
+
+Size, access and limits of each object are tested, and the values of 2000h in each link state.
+"""
 
 import struct
 
@@ -11,21 +14,48 @@ from kontronik_can_gw.esc.kontronik.codec import encode as uart
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.status import GatewayState
 
-NO_OBJECT, NO_SUB, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
-TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x06070012, 0x06070013, 0x06090031, 0x06090032
-DEVICE_STATE, NO_DATA = 0x08000022, 0x08000024
+NO_OBJECT = 0x06020000
+NO_SUB = 0x06090011
+READ_ONLY = 0x06010002
+WRITE_ONLY = 0x06010001
+TOO_LONG = 0x06070012
+TOO_SHORT = 0x06070013
+TOO_HIGH = 0x06090031
+TOO_LOW = 0x06090032
+DEVICE_STATE = 0x08000022
+NO_DATA = 0x08000024
 FORMATS = {0x01: "?", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I", 0x08: "f"}
 TEXTS = (0x09, 0x0F)
 
-LIVE = LiveData(70_000, 2442, -12, 34, 56, 789, 1234, 5678, 1500, -50, 60, -7, 8, 1 << 17, 26, 9)
+LIVE = LiveData(
+    70_000,
+    2442,
+    -12,
+    34,
+    56,
+    789,
+    1234,
+    5678,
+    1500,
+    -50,
+    60,
+    -7,
+    8,
+    1 << 17,
+    26,
+    9,
+)
+# fmt: off
 INFO = InfoData(
-    1 << 10 | 120, 4 << 8 | 17, 3, 6, 100_000, 2000, 2520, 100, 200, 300, 4, 5000, 99, 100, -10, 90, -11, 50,
-)  # fmt: skip
+    1 << 10 | 120, 4 << 8 | 17, 3, 6, 100_000, 2000, 2520, 100, 200, 300, 4, 5000, 99, 100,
+    -10, 90, -11, 50,
+)
+# fmt: on
 
 
 @pytest.fixture(scope="module")
 def bench() -> Bench:
-    """Never written to a lasting effect."""
+    """Return a bench for all tests of this file. No write may change it permanently."""
     return Bench(changes=QUIET)
 
 
@@ -38,13 +68,15 @@ def of(entry: Entry) -> str:
 
 
 def ends(entry: Entry) -> tuple[int, int]:
-    """Smallest and greatest value of the type."""
+    """Return the smallest and the largest value of the type."""
     bits = 8 * struct.calcsize(FORMATS[entry.data_type])
-    signed = FORMATS[entry.data_type].islower()
-    return (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    is_signed = FORMATS[entry.data_type].islower()
+    if is_signed:
+        return -(1 << bits - 1), (1 << bits - 1) - 1
+    return 0, (1 << bits) - 1
 
 
-def test_every_other_index_is_06020000h_and_every_other_sub_index_06090011h(bench: Bench) -> None:
+def test_unknown_indices_and_sub_indices_abort_with_their_codes(bench: Bench) -> None:
     known = entries()
     indices = {index for index, _ in known}
     found = {index: bench.read(index) for index in set(range(0x10000)) - indices}
@@ -52,18 +84,21 @@ def test_every_other_index_is_06020000h_and_every_other_sub_index_06090011h(benc
     unknown = "0000 0001 1006 1201 1400 1600 1806 2003 5FFF 6000 A000 FFFF"
     for index in (int(text, 16) for text in unknown.split()):
         assert bench.write(index, 0, 0) == NO_OBJECT
-    for index, sub in {(index, sub) for index in indices for sub in range(256)} - known.keys():
-        assert bench.read(index, sub) == bench.write(index, sub, 0) == NO_SUB
+    for index in indices:
+        for sub in range(256):
+            if (index, sub) not in known:
+                assert bench.read(index, sub) == NO_SUB
+                assert bench.write(index, sub, 0) == NO_SUB
 
 
 @pytest.mark.parametrize("entry", shipped_eds().entries, ids=of)
-def test_size_and_access(bench: Bench, entry: Entry) -> None:
+def test_every_object_has_its_size_and_access(bench: Bench, entry: Entry) -> None:
     at = entry.index, entry.sub
     data = bench.read(*at)
     if entry.access == "wo":
         assert data == WRITE_ONLY
     elif isinstance(data, int):
-        assert data == NO_DATA  # nothing has come from the ESC
+        assert data == NO_DATA  # no frame of the ESC has arrived
         assert entry.index in (0x1003, 0x2000, 0x2001, 0x2010, 0x2011, 0x2020, 0x606C, 0x6079)
     elif entry.data_type not in TEXTS:
         assert len(data) == struct.calcsize(FORMATS[entry.data_type])
@@ -80,12 +115,12 @@ def test_size_and_access(bench: Bench, entry: Entry) -> None:
 
 
 LIMITED = [entry for entry in shipped_eds().entries if "w" in entry.access]
-# further rules than limits, tested by dialogues
 RULED = {0x1003, 0x1005, 0x1010, 0x1011, 0x1014, 0x1F80, 0x2101, 0x2102}
+"""Objects with further rules than limits, which dialogues test."""
 
 
 @pytest.mark.parametrize("entry", LIMITED, ids=of)
-def test_limits(entry: Entry, bench: Bench) -> None:
+def test_every_object_enforces_its_limits(entry: Entry, bench: Bench) -> None:
     at = entry.index, entry.sub
     least, most = ends(entry)
     low = least if entry.low is None else entry.low
@@ -107,7 +142,7 @@ def test_limits(entry: Entry, bench: Bench) -> None:
         assert bench.write(*at, before) is None
 
 
-def test_the_serial_number_and_the_vendor_are_the_configurations() -> None:
+def test_serial_number_and_vendor_are_taken_from_the_configuration() -> None:
     bench = Bench(2, vendor_id=0x12345, version="1.2.3")
     assert [bench.number(0x1018, 4, node) for node in (1, 2)] == [77, 78]
     assert bench.number(0x1018, 1) == 0x12345
@@ -118,7 +153,7 @@ def test_the_serial_number_and_the_vendor_are_the_configurations() -> None:
 
 
 def values(data: LiveData | InfoData) -> list[bytes]:
-    """Wire bytes of each field."""
+    """Return the wire bytes of each field."""
     wires = {name: row.wire for name, row in rows(type(data)).items()}
     return [struct.pack(f"<{wire}", getattr(data, name)) for name, wire in wires.items()]
 
@@ -126,14 +161,15 @@ def values(data: LiveData | InfoData) -> list[bytes]:
 ALL_LIVE = [
     *((0x2000, sub) for sub in range(1, 17)),
     *((0x2001, sub) for sub in (1, 2, 3, 5)),
-    *((0x606C, 0), (0x6079, 0)),
+    (0x606C, 0),
+    (0x6079, 0),
 ]
-"""Objects that come and go with live data."""
+"""Objects that are available only with fresh live data."""
 INFORMATION = [*((0x2010, sub) for sub in range(1, 8)), *((0x2011, sub) for sub in range(1, 15))]
 
 
 def fed(behaviour: int = 0) -> Bench:
-    """A node whose ESC has just sent both frames. ``behaviour``: 2100h:5."""
+    """Return a node whose ESC has just sent both frames. ``behaviour`` is the value of 2100h:5."""
     bench = Bench(changes=QUIET)
     assert bench.write(0x2100, 5, behaviour, size=1) is None
     bench.wait(10)
@@ -143,14 +179,14 @@ def fed(behaviour: int = 0) -> Bench:
     return bench
 
 
-def test_fresh_values_are_those_of_the_uart_frame() -> None:
+def test_fresh_values_equal_those_of_the_uart_frame() -> None:
     bench = fed()
     assert [bench.read(0x2000, sub) for sub in range(1, 17)] == values(LIVE)
     assert [bench.number(0x2010, sub) for sub in range(1, 6)] == [1, 120, 0x0411, 3, 6]
     assert [bench.read(0x2010, sub) for sub in (6, 7)] == [b"KOSMIK", b"4.17"]
     assert [bench.read(0x2011, sub) for sub in range(1, 15)] == values(INFO)[4:]
     assert bench.number(0x2001, 1) == bench.number(0x606C) == 70_000
-    # 24.42 V, -1.2 A: -29.304 W
+    # 24.42 V and -1.2 A give -29.304 W.
     assert bench.read(0x2001, 3) == (-293).to_bytes(4, "little", signed=True)
     assert bench.number(0x2001, 5) == 4070
     assert bench.number(0x6079) == 24420
@@ -164,10 +200,11 @@ def lose(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("behaviour", [0, 1, 2])
-def test_lost_values_abort_or_stay_or_are_codes_by_setting_and_the_others_keep_theirs(
+def test_lost_values_abort_or_remain_or_are_codes_as_configured(
     behaviour: int,
 ) -> None:
-    bench, known = fed(behaviour), entries()
+    bench = fed(behaviour)
+    known = entries()
     kept = [*INFORMATION, (0x2001, 4), (0x2001, 6)]
     fresh = {at: bench.read(*at) for at in [*ALL_LIVE, *kept]}
     assert not any(isinstance(data, int) for data in fresh.values())
@@ -183,7 +220,7 @@ def test_lost_values_abort_or_stay_or_are_codes_by_setting_and_the_others_keep_t
     assert bench.number(0x2020, 10) == 1
 
 
-def test_status_registers() -> None:
+def test_the_status_registers_show_link_and_controller_state() -> None:
     bench = fed()
     bench.can_state("ERROR_PASSIVE")
     assert bench.number(0x1002) == 0x00030382

@@ -1,4 +1,7 @@
-"""Masters of others: what dcf-tools' dcfgen (Lely, ros2_canopen) and the canopen package make of the shipped EDS, and LSS (CiA 305)."""
+"""The shipped EDS with masters of other projects, and LSS (CiA 305).
+
+The masters are dcf-tools' dcfgen (Lely, ros2_canopen) and the canopen package.
+"""
 
 import struct
 import subprocess
@@ -40,8 +43,9 @@ left:
 
 
 def concise(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """The objects of a concise DCF (CiA 302-3): count, then index, sub-index, size and data of each."""
-    (count,), at = struct.unpack_from("<L", data), 4
+    """Yield index, sub-index and data of each object of a concise DCF (CiA 302-3)."""
+    (count,) = struct.unpack_from("<L", data)
+    at = 4
     for _ in range(count):
         index, sub, size = struct.unpack_from("<HBL", data, at)
         yield index, sub, data[at + 7 : at + 7 + size]
@@ -49,7 +53,7 @@ def concise(data: bytes) -> Iterator[tuple[int, int, bytes]]:
     assert at == len(data)
 
 
-def test_each_object_of_dcfgens_concise_dcf_is_accepted_and_the_pdos_are_what_the_bus_file_says(
+def test_dcfgens_concise_dcf_is_accepted_and_sets_the_pdos(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "bus.yml").write_text(BUS.format(eds=EDS))
@@ -79,11 +83,13 @@ def test_each_object_of_dcfgens_concise_dcf_is_accepted_and_the_pdos_are_what_th
     assert 0x680 in {frame.can_id for frame in bench.take()}, "the event timer"
 
 
-def test_the_canopen_package_saves_a_pdo_that_it_did_not_read_before() -> None:
+def test_the_canopen_package_can_save_a_pdo_without_reading_it_first() -> None:
     bench = Bench(changes=NO_HEARTBEAT)
     node = wire_to(bench).add_node(1, str(EDS))
     pdo = node.tpdo[5]
-    pdo.cob_id, pdo.trans_type, pdo.event_timer = 0x1F1, 254, 100
+    pdo.cob_id = 0x1F1
+    pdo.trans_type = 254
+    pdo.event_timer = 100
     pdo.enabled = pdo.rtr_allowed = True
     pdo.add_variable(0x2000, 2)
     pdo.save()
@@ -97,25 +103,26 @@ def test_the_canopen_package_saves_a_pdo_that_it_did_not_read_before() -> None:
 
 
 def master_of(bench: Bench) -> Any:
-    """A foreign master whose requests all nodes hear."""
+    """Return a foreign master whose requests all nodes receive."""
     master: Any = wire_to(bench).lss
-    master.RESPONSE_TIMEOUT = 0.0002  # what is answered is there before it waits
+    master.RESPONSE_TIMEOUT = 0.0002  # an answer is available before it waits
     return master
 
 
 @pytest.fixture(autouse=True)
 def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The foreign master pauses 200 ms after each part of an identity, for slow devices."""
+    """Remove the foreign master's pauses of 200 ms after each part of an identity."""
     monkeypatch.setattr(canopen.lss, "time", SimpleNamespace(sleep=lambda _: None))
 
 
-def test_a_foreign_master_finds_each_of_several_slaves_by_fastscan_and_gives_it_a_node_id() -> None:
+def test_a_foreign_master_finds_slaves_by_fastscan_and_sets_node_ids() -> None:
     bench = Bench(node_ids=[UNCONFIGURED] * 6 + [100], changes=QUIET)
     master = master_of(bench)
     for number in range(1, 7):
         ok, found = master.fast_scan()
         place = found[3] - 77
-        assert ok and tuple(found) == bench.nodes[place].identity.identity
+        assert ok
+        assert tuple(found) == bench.nodes[place].identity.identity
         assert [n for n, node in enumerate(bench.nodes) if node.lss.configuring] == [place]
         master.configure_node_id(number)
         assert master.inquire_lss_address(canopen.lss.CS_INQUIRE_SERIAL_NUMBER) == found[3]
@@ -124,7 +131,7 @@ def test_a_foreign_master_finds_each_of_several_slaves_by_fastscan_and_gives_it_
     assert master.fast_scan() == (False, None)
 
 
-def test_a_foreign_master_configures_and_stores() -> None:
+def test_a_foreign_master_configures_and_stores_a_node_id() -> None:
     bench = Bench(node_ids=[UNCONFIGURED] * 3, changes=QUIET)
     master = master_of(bench)
     identity = bench.nodes[1].identity.identity

@@ -1,4 +1,7 @@
-"""Whatever comes: nothing raises, states change as the standard says, equal input gives equal output."""
+"""Properties of nodes with any input.
+
+No exception is raised, states change by the standard, and equal input gives equal output.
+"""
 
 from typing import Any
 
@@ -15,34 +18,38 @@ NODES = 2
 known_ids = st.sampled_from(
     [0, 0x80, 0x81, 0x181, 0x581, 0x601, 0x602, 0x67F, 0x701, 0x705, 0x7E4, 0x7E5]
 )
+# fmt: off
 objects = st.sampled_from(
     [
-        0x1000, 0x1003, 0x1005, 0x1008, 0x1010, 0x1011, 0x1014, 0x1016, 0x1017, 0x1019, 0x1021, 0x1029,
-        0x1800, 0x1801, 0x1A00, 0x1F80, 0x2000, 0x2020, 0x2100, 0x2101, 0x2102, 0x603F, 0x3000,
+        0x1000, 0x1003, 0x1005, 0x1008, 0x1010, 0x1011, 0x1014, 0x1016, 0x1017, 0x1019, 0x1021,
+        0x1029, 0x1800, 0x1801, 0x1A00, 0x1F80, 0x2000, 0x2020, 0x2100, 0x2101, 0x2102, 0x603F,
+        0x3000,
     ]
-)  # fmt: skip
+)
+# fmt: on
 
 
 @st.composite
 def sdo_requests(draw: st.DrawFn) -> CanFrame:
-    """Requests that are more than noise: known objects, useful values."""
+    """Draw requests to known objects with useful values."""
     command = draw(
         st.sampled_from(bytes.fromhex("2F 2B 23 21 22 40 60 70 00 10 01 80 A0 A4 C2 C6"))
     )
     words = [b"save", b"load", b"rset", bytes(4), b"\x81\1\0\x40", b"\x81\1\0\xc0", b"\xc8\0\5\0"]
     value = draw(st.one_of(st.binary(min_size=4, max_size=4), st.sampled_from(words)))
-    multiplexer = draw(objects).to_bytes(2, "little") + bytes((draw(st.integers(0, 9)),))
-    return CanFrame(0x600 + draw(st.integers(1, NODES)), bytes((command,)) + multiplexer + value)
+    index = draw(objects)
+    sub = draw(st.integers(0, 9))
+    node_id = draw(st.integers(1, NODES))
+    multiplexer = index.to_bytes(2, "little") + bytes((sub,))
+    return CanFrame(0x600 + node_id, bytes((command,)) + multiplexer + value)
 
 
 @st.composite
 def lss_requests(draw: st.DrawFn) -> CanFrame:
-    service = draw(
-        st.sampled_from([0x04, 0x11, 0x13, 0x15, 0x17, 0x40, 0x43, 0x46, 0x4C, 0x51, 0x5A, 0x5E])
-    )
-    return CanFrame(
-        0x7E5, bytes((service, draw(st.sampled_from([0, 1, 2, 9, 128, 255])))) + bytes(6)
-    )
+    services = [0x04, 0x11, 0x13, 0x15, 0x17, 0x40, 0x43, 0x46, 0x4C, 0x51, 0x5A, 0x5E]
+    service = draw(st.sampled_from(services))
+    value = draw(st.sampled_from([0, 1, 2, 9, 128, 255]))
+    return CanFrame(0x7E5, bytes((service, value)) + bytes(6))
 
 
 any_frames = st.builds(
@@ -59,7 +66,13 @@ nmt_frames = st.builds(
     st.sampled_from([1, 2, 128, 129, 130]),
     st.sampled_from([0, 1, 2]),
 )
-frames = st.one_of(any_frames, plain_frames, nmt_frames, sdo_requests(), lss_requests())
+frames = st.one_of(
+    any_frames,
+    plain_frames,
+    nmt_frames,
+    sdo_requests(),
+    lss_requests(),
+)
 happenings = st.one_of(
     st.tuples(st.just("frame"), frames),
     st.tuples(st.just("uart"), st.integers(0, NODES - 1), st.integers(0, 0xFFFFFFFF)),
@@ -74,14 +87,17 @@ happenings = st.one_of(
 
 
 def happen(bench: Bench, what: tuple[Any, ...]) -> None:
-    gateway, now = bench.gateway, bench.now
+    gateway = bench.gateway
+    now = bench.now
     match what:
         case "frame", frame:
             gateway.receive_frame(frame, now, now)
         case "uart", esc, word:
-            gateway.receive_bytes(esc, live(operating_errors=word, electrical_speed=word), now, now)
+            data = live(operating_errors=word, electrical_speed=word)
+            gateway.receive_bytes(esc, data, now, now)
         case "info", esc:
-            gateway.receive_bytes(esc, info(device_and_variant=1 << 10, cell_count=6), now, now)
+            data = info(device_and_variant=1 << 10, cell_count=6)
+            gateway.receive_bytes(esc, data, now, now)
         case "bytes", esc, data:
             gateway.receive_bytes(esc, data, now, now)
         case "can", state:
@@ -103,10 +119,11 @@ def happen(bench: Bench, what: tuple[Any, ...]) -> None:
 
 @given(st.lists(happenings, max_size=50))
 @FEW
-def test_nothing_raises_equal_input_gives_equal_output_and_every_frame_is_one_that_the_bus_can_carry(
+def test_any_input_raises_nothing_and_gives_reproducible_valid_frames(
     story: list[tuple[Any, ...]],
 ) -> None:
-    one, other = Bench(NODES), Bench(NODES)
+    one = Bench(NODES)
+    other = Bench(NODES)
     for what in story:
         happen(one, what)
         happen(other, what)
@@ -126,18 +143,19 @@ STATE_AFTER = {1: 5, 2: 4, 128: 127, 129: 127, 130: 127}
 
 @given(st.lists(st.one_of(any_frames, plain_frames, nmt_frames, sdo_requests(), lss_requests())))
 @FEW
-def test_states_change_by_nmt_commands_only_and_only_who_was_asked_answers(
+def test_only_nmt_commands_change_states_and_only_asked_nodes_answer(
     story: list[CanFrame],
 ) -> None:
-    """Foreign ids and other nodes' ids cause no frame at all; its own ids from others one EMCY 8150h."""
+    """Other ids cause no frame. A node's own ids from another device cause one EMCY 8150h."""
     bench = Bench(NODES, changes={**NO_HEARTBEAT, **default(0x1029, 1, 1)})
     for frame in story:
         if frame.can_id in (0x601, 0x602) and frame.data[1:3] == b"\x01\x21":
-            continue  # 2101h: another node-ID from the next reset on
+            continue  # 2101h sets another node-ID at the next reset
         if frame.can_id == 0x7E5 and frame.data[:1] == b"\x11":
-            continue  # LSS: likewise
-        plain = not (frame.extended or frame.remote or frame.fd)
-        command = frame.data if plain and frame.can_id == 0 and len(frame.data) == 2 else b"\0\0"
+            continue  # so does LSS
+        is_plain = not (frame.extended or frame.remote or frame.fd)
+        is_nmt = is_plain and frame.can_id == 0 and len(frame.data) == 2
+        command = frame.data if is_nmt else b"\0\0"
         meant = [node for node in bench.nodes if command[1] in (0, node.node_id)]
         wanted = {node: int(node.state) for node in bench.nodes}
         wanted |= {node: STATE_AFTER.get(command[0], wanted[node]) for node in meant}
@@ -161,17 +179,18 @@ def test_states_change_by_nmt_commands_only_and_only_who_was_asked_answers(
 
 @given(st.lists(happenings, max_size=40))
 @FEW
-def test_no_pdo_outside_operational_no_emergency_while_stopped(
+def test_no_pdo_is_sent_outside_operational_and_no_emergency_when_stopped(
     story: list[tuple[Any, ...]],
 ) -> None:
     bench = Bench(NODES)
     for what in story:
         if what[0] == "frame" and what[1].can_id in (0x601, 0x602, 0x7E5):
-            continue  # may move COB-IDs and node-IDs
+            continue  # such a frame may change COB-IDs and node-IDs
         before = [node.state for node in bench.nodes]
         happen(bench, what)
         for frame in bench.take():
-            service, number = frame.can_id & 0x780, (frame.can_id & 0x7F) - 1
+            service = frame.can_id & 0x780
+            number = (frame.can_id & 0x7F) - 1
             if before[number] == bench.nodes[number].state:
                 assert service not in (0x180, 0x280, 0x380, 0x480) or before[number] == 5
                 is_nmt = what[0] == "frame" and what[1].can_id == 0

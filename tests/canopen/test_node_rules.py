@@ -1,4 +1,7 @@
-"""Rules of a node that dialogues in files cannot show well: every value of a range, long traffic, the DBC beside, what is on disk."""
+"""Rules of a node that dialogues cannot test well.
+
+They concern every value of a range, long traffic, the DBC messages, and the data on disk.
+"""
 
 import hashlib
 import itertools
@@ -17,12 +20,11 @@ from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.runtime.system.machine import machine_identity, serial_number
 from kontronik_can_gw.signals.plan import Layout
 
-VALUE, TAKEN = 0x06090030, 0x06040043
+VALUE = 0x06090030
+TAKEN = 0x06040043
 
 
-def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_it_has_ceased() -> (
-    None
-):
+def test_an_id_conflict_is_reported_once_and_cleared_when_it_ends() -> None:
     bench = Bench(changes=QUIET)
     bench.take()
     for n in range(300):
@@ -40,12 +42,16 @@ def test_somebody_else_with_an_id_of_the_node_is_told_once_and_taken_back_when_i
     ]
 
 
-def test_all_pdos_that_a_uart_frame_causes_carry_that_frame() -> None:
-    numbers, speed_only = range(1, 5), (254, 0, 0, 0x20000120)
-    tpdos = {place: change for n in numbers for place, change in tpdo(n, *speed_only).items()}
-    bench = Bench(changes={**QUIET, **tpdos}).start()
+def test_all_pdos_caused_by_a_uart_frame_carry_its_values() -> None:
+    numbers = range(1, 5)
+    speed_only = (254, 0, 0, 0x20000120)
+    changes = dict(QUIET)
+    for number in numbers:
+        changes |= tpdo(number, *speed_only)
+    bench = Bench(changes=changes).start()
     bench.now = 10 * MS
-    bench.uart(b"".join(live(electrical_speed=s) for s in range(1, 21)))  # in one read: the newest
+    one_read = [live(electrical_speed=speed) for speed in range(1, 21)]
+    bench.uart(b"".join(one_read))  # only the newest of one read is sent
     speeds = range(20, 200)
     for speed in speeds[1:]:
         bench.now += 10 * MS
@@ -54,30 +60,45 @@ def test_all_pdos_that_a_uart_frame_causes_carry_that_frame() -> None:
     assert sent == [(0x81 + 0x100 * number, speed) for speed in speeds for number in numbers]
 
 
-@pytest.mark.parametrize(("threshold", "link_status"), [(3, 3), (4, 2)])
-def test_2100h_8_is_how_many_crc_errors_in_a_second_make_a_link_degraded(
-    threshold: int, link_status: int
+@pytest.mark.parametrize(
+    ("threshold", "link_status"),
+    [
+        (3, 3),
+        (4, 2),
+    ],
+)
+def test_2100h_8_sets_the_crc_errors_a_second_of_a_degraded_link(
+    threshold: int,
+    link_status: int,
 ) -> None:
     bench = Bench(changes=QUIET)
     assert bench.write(0x2100, 8, threshold, size=2) is None
+    damaged = live()[:-1] + b"\xff"
     for number in range(150):
         bench.wait(10)
-        bench.uart(live() + (live()[:-1] + b"\xff" if number in (20, 40, 60) else b""))
+        data = live()
+        if number in (20, 40, 60):
+            data += damaged
+        bench.uart(data)
     assert bench.number(0x2020, 1) == link_status
 
 
-def test_a_restricted_cob_id_is_refused_and_every_other_accepted() -> None:
+def test_a_restricted_cob_id_is_refused_and_every_other_is_accepted() -> None:
     bench = Bench(changes={**QUIET, **SPARE})
     ends = (0, 0x80), (0x101, 0x181), (0x581, 0x600), (0x601, 0x680), (0x6E0, 0x700), (0x701, 0x800)
     reserved = {cob_id for pair in ends for cob_id in range(*pair)}
     ours = {0x80, 0x81}
     for cob_id in range(0x800):
-        wanted = VALUE if cob_id in reserved else TAKEN if cob_id in ours else None
+        wanted = None
+        if cob_id in ours:
+            wanted = TAKEN
+        if cob_id in reserved:
+            wanted = VALUE
         assert bench.write(0x1804, 1, 0x40000000 | cob_id) == wanted, hex(cob_id)
         bench.write(0x1804, 1, OFF)
 
 
-def test_ids_of_other_pdos_of_all_nodes_and_of_the_dbc_are_taken() -> None:
+def test_ids_of_pdos_of_all_nodes_and_of_the_dbc_cannot_be_used() -> None:
     ours = {0x705: 5, 0x606: 6, 0x587: 7, 0x88: 8, 0x18A: 10}
     layout = Layout("", "", tuple(message_plan(f"M{i}", i, ()) for i in (0x222, *ours)))
     bench = Bench(2, changes={**NO_HEARTBEAT, **SPARE}, layout=layout)
@@ -92,7 +113,7 @@ def test_ids_of_other_pdos_of_all_nodes_and_of_the_dbc_are_taken() -> None:
     assert bench.write(0x2101, 2, 9, size=1) is None
 
 
-def test_each_mappable_object_can_be_sent_and_carries_what_sdo_reads() -> None:
+def test_each_mappable_object_can_be_sent_and_equals_its_sdo_value() -> None:
     bench = Bench(changes={**QUIET, **default(0x2100, 5, 2)})
     fields = {"electrical_speed": 66051, "battery_voltage": 2442, "bec_current": 5}
     bench.uart(live(**fields, operating_state=26, throttle=-5))
@@ -127,7 +148,7 @@ def test_serial_numbers_differ_by_number_name_and_machine(tmp_path: Path) -> Non
 
 
 def loaded_nodes(tmp_path: Path) -> tuple[Loaded, list[Node]]:
-    """A configuration of two ESCs, and its nodes as they start."""
+    """Return a configuration of two ESCs, and its nodes in their initial state."""
     canopen = {"enabled": True, "store": str(tmp_path)}
     tables = {"canopen": canopen, "esc": [{"port": "p1"}, {"port": "p2"}]}
     loaded = assemble(parse(tables, "test"))
@@ -146,7 +167,8 @@ def u32(value: int) -> bytes:
     return value.to_bytes(4, "little")
 
 
-SPARE_ON, MAPPED = {0x180501: u32(0x40000680)}, {0x1A0500: b"\1", 0x1A0501: u32(0x20000220)}
+SPARE_ON = {0x180501: u32(0x40000680)}
+MAPPED = {0x1A0500: b"\1", 0x1A0501: u32(0x20000220)}
 EVENT_TIMERS = {(0x1800 + n) << 8 | 5: b"\1\0" for n in range(4)}
 
 
@@ -163,8 +185,9 @@ EVENT_TIMERS = {(0x1800 + n) << 8 | 5: b"\1\0" for n in range(4)}
         {"esc1": Stored(None, EVENT_TIMERS | {0x101700: b"\1\0"})},
     ],
 )
-def test_nothing_a_master_stored_keeps_the_gateway_from_starting(
-    tmp_path: Path, stored: dict[str, Stored]
+def test_no_stored_value_prevents_the_gateway_from_starting(
+    tmp_path: Path,
+    stored: dict[str, Stored],
 ) -> None:
     keep(tmp_path, **stored)
     loaded, nodes = loaded_nodes(tmp_path)
@@ -172,20 +195,28 @@ def test_nothing_a_master_stored_keeps_the_gateway_from_starting(
     for node in nodes:
         for cob_id, what, *_ in node.uses():
             assert ids.setdefault(cob_id, what) == what
-    # said at start, or by the node when it boots
+    # It is reported at the start, or by the node when it boots.
     assert loaded.warnings or any(node.parameters.rejected for node in nodes)
 
 
-@pytest.mark.parametrize("clashing", [Stored(2), Stored(communication={0x101400: u32(0x82)})])
-def test_1020h_does_not_stay_where_something_stored_with_it_gave_way(
-    tmp_path: Path, clashing: Stored
+@pytest.mark.parametrize(
+    "clashing",
+    [
+        Stored(2),
+        Stored(communication={0x101400: u32(0x82)}),
+    ],
+)
+def test_1020h_is_cleared_if_a_value_stored_with_it_is_rejected(
+    tmp_path: Path,
+    clashing: Stored,
 ) -> None:
     verify = {0x102001: u32(15685), 0x102002: u32(43_200_000), 0x101700: b"\xf4\x01"}
     for stored, expected in ((Stored(7), 15685), (clashing, 0)):
         keep(tmp_path, esc1=Stored(stored.node_id, {**stored.communication, **verify}))
         _, nodes = loaded_nodes(tmp_path)
         number = nodes[0].dictionary.number
-        assert (number(0x1020, 1), number(0x1017)) == (expected, 500)
+        assert number(0x1020, 1) == expected
+        assert number(0x1017) == 500
 
 
 def test_swapped_node_ids_are_kept(tmp_path: Path) -> None:
@@ -195,7 +226,7 @@ def test_swapped_node_ids_are_kept(tmp_path: Path) -> None:
     assert loaded.warnings == ()
 
 
-def test_the_stored_node_id_gives_way_and_not_the_node_that_has_it_by_right(tmp_path: Path) -> None:
+def test_a_stored_node_id_is_rejected_if_another_node_is_set_to_it(tmp_path: Path) -> None:
     moved = {0x180001: u32(0x40000300)}
     keep(tmp_path, esc1=Stored(2), esc2=Stored(None, moved))
     loaded, nodes = loaded_nodes(tmp_path)

@@ -1,4 +1,4 @@
-"""What goes on a bus by itself: after an outage, from link and gateway counters, in which order; and which ids are a node's own."""
+"""The order of a node's frames, values that do not fit, node-IDs before the start, and bus load."""
 
 from dialogue import EMPTY, QUIET, Bench, live, tpdo
 
@@ -15,8 +15,8 @@ CRC_ERRORS = LINK << 16 | 0x0720
 SENT_FRAMES = GATEWAY << 16 | 0x0320
 
 
-def test_of_what_a_node_answers_nothing_is_overtaken() -> None:
-    """Only measurements are; SDO answers, emergencies and heartbeats of one id all go, in their order."""
+def test_answers_of_a_node_are_never_overtaken() -> None:
+    """SDO answers, emergencies and heartbeats of one id are all sent in order."""
     bench = Bench(changes=QUIET)
     for place in ("00 10 00", "18 10 01", "18 10 04"):
         bench.put(0x601, f"40 {place} 00 00 00 00")
@@ -27,12 +27,12 @@ def test_of_what_a_node_answers_nothing_is_overtaken() -> None:
     bench.put(0x601, "40 00 10 00 00 00 00 00")
     frames = bench.take()
     assert [frame.can_id for frame in frames] == [0x581] * 3 + [0x81] * 2 + [0x701, 0x581]
-    waiting = TransmitQueue()  # of a gateway whose interface was busy until now
+    waiting = TransmitQueue()  # the queue of a gateway whose interface was busy
     waiting.put_all(frames)
     assert waiting.take_all() == frames
 
 
-def test_a_stored_value_that_does_not_fit_is_reported_at_each_reset_once() -> None:
+def test_a_stored_value_that_does_not_fit_is_reported_once_at_each_reset() -> None:
     stored = Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})
     bench = Bench(changes=QUIET, stored=[stored])
     assert sorted(bench.gateway.take_rejected_parameters()) == [(0, 0x101700), (0, 0x210001)]
@@ -43,8 +43,8 @@ def test_a_stored_value_that_does_not_fit_is_reported_at_each_reset_once() -> No
     assert sorted(bench.gateway.take_rejected_parameters()) == [(0, 0x101700), (0, 0x210001)]
 
 
-def test_the_node_ids_to_be_claimed_are_known_before_the_start() -> None:
-    """Locks between gateways are taken while nothing has been sent yet."""
+def test_the_node_ids_to_lock_are_known_before_the_start() -> None:
+    """Locks between gateways are taken before the first frame is sent."""
     setup = Bench(node_ids=[5, 9, UNCONFIGURED]).setup
     gateway = Gateway([EscSettings(f"esc{n}") for n in range(3)], EMPTY, 0, outputs=[setup])
     assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]
@@ -52,7 +52,7 @@ def test_the_node_ids_to_be_claimed_are_known_before_the_start() -> None:
     assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]
 
 
-def test_what_the_bus_has_to_carry_is_reckoned_with_the_pace_of_each_pdo() -> None:
+def test_the_bus_load_is_computed_from_the_rate_of_each_pdo() -> None:
     def rate(*mapped: int, kind: int = 255, timer: int = 0) -> float:
         bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, timer, *mapped)}).start()
         return traffic(bench.nodes, is_worst=False)[0]

@@ -1,4 +1,4 @@
-"""The SDO server under random traffic, against a client of our own that loses segments, and ``canopen``'s client."""
+"""The SDO server with random traffic, our client that loses segments, and ``canopen``'s client."""
 
 import random
 from binascii import crc_hqx
@@ -27,7 +27,7 @@ COMMANDS = bytes.fromhex("00 0F 10 1F 40 21 20 23 2F 22 60 70 80 A0 A1 A2 A3 A4 
 
 @st.composite
 def requests(draw: st.DrawFn) -> bytes:
-    """Any bytes, a command to a known object, or a segment of a block."""
+    """Draw any bytes, a command to a known object, or a segment of a block."""
     index, sub = draw(st.sampled_from(PLACES))
     command = draw(st.one_of(st.sampled_from(COMMANDS), st.integers(0, 255)))
     tail = draw(st.one_of(st.sampled_from([b"\x04\0\0\0", b"\x7f\x05\0\0"]), st.binary(max_size=5)))
@@ -35,26 +35,32 @@ def requests(draw: st.DrawFn) -> bytes:
 
 
 def is_answer_to(request: bytes, answer: bytes) -> bool:
-    """By CiA 301, 7.2.4.3: the server command that fits the client command, or an abort; the multiplexer of an initiate."""
-    client, server = request[0] >> 5, answer[0] >> 5
+    """Return whether an answer fits a request by CiA 301, 7.2.4.3.
+
+    It is an abort or has the server command for the client command. An answer to an initiate
+    request has its multiplexer.
+    """
+    client = request[0] >> 5
+    server = answer[0] >> 5
     if len(answer) != 8:
         return False
-    initiate = (
-        client in (1, 2)
-        or (client == 5 and request[0] & 3 == 0)
-        or (client == 6 and not request[0] & 1)
-    )
-    if answer[0] == 0x80:
-        return not initiate or answer[1:4] == request[1:4]
-    if initiate and answer[1:4] != request[1:4]:
+    is_initiate = client in (1, 2)
+    if client == 5:
+        is_initiate = request[0] & 3 == 0
+    if client == 6:
+        is_initiate = not request[0] & 1
+    if is_initiate and answer[1:4] != request[1:4]:
         return False
-    # 2 also answers a block upload that is smaller than the client's threshold
-    return server in {0: (1,), 1: (3,), 2: (2,), 3: (0,), 5: (6, 2), 6: (5,)}.get(client, ())
+    if answer[0] == 0x80:
+        return True
+    # 2 also answers a block upload that is smaller than the client's threshold.
+    servers = {0: (1,), 1: (3,), 2: (2,), 3: (0,), 5: (6, 2), 6: (5,)}
+    return server in servers.get(client, ())
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(requests(), st.sampled_from([0, MS, 60 * MS, 2000 * MS])), max_size=40))
-def test_each_request_gets_one_right_answer_and_the_next_client_is_served(
+def test_each_request_gets_one_valid_answer_and_later_clients_are_served(
     story: list[tuple[bytes, int]],
 ) -> None:
     bench = Bench()
@@ -65,7 +71,7 @@ def test_each_request_gets_one_right_answer_and_the_next_client_is_served(
         waited = bench.server.waiting is not None
         answers = bench.request(request)
         if in_block:
-            assert len(answers) <= 127  # the segments of a sub-block, or none within one
+            assert len(answers) <= 127  # the segments of a sub-block, or no answer within one
         elif len(request) != 8 or request[0] >> 5 == 4:
             assert answers == []  # an abort has no answer
         elif bench.server.waiting is None and not waited:
@@ -76,7 +82,8 @@ def test_each_request_gets_one_right_answer_and_the_next_client_is_served(
             bench.pass_time(bench.now + 60 * MS)  # segments before the client sees an abort
     bench.pass_time(bench.now + 2000 * MS)
     bench.server.confirm(None)
-    assert not bench.server.busy and bench.server.due == NEVER
+    assert not bench.server.busy
+    assert bench.server.due == NEVER
     client = Client(bench)
     client.block_download(b"anything", tell_size=True, with_crc=True)
     assert upload(client.answer, 0x2003, 0) == b"anything"
@@ -86,11 +93,18 @@ def test_each_request_gets_one_right_answer_and_the_next_client_is_served(
 
 
 class Client:
-    """A client of block transfers with 2003h. ``lose``: asked before each segment, in either direction, whether it gets lost."""
+    """A client of block transfers with 2003h.
+
+    ``lose`` is called before each segment in either direction, and returns whether it is lost.
+    """
 
     multiplexer = b"\x03\x20\0"
 
-    def __init__(self, bench: Bench, lose: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        lose: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.bench = bench
         self.lose = lose
 
@@ -103,16 +117,20 @@ class Client:
         return answer_to(self.answer, request)
 
     def block_download(self, data: bytes, tell_size: bool, with_crc: bool) -> int:
-        """Returns how many sub-blocks it took."""
+        """Download data in blocks. Return the number of sub-blocks."""
         size = len(data).to_bytes(4, "little") if tell_size else bytes(4)
-        answer = self.ask(bytes((0xC0 | with_crc << 2 | tell_size << 1,)) + self.multiplexer + size)
+        command = 0xC0 | with_crc << 2 | tell_size << 1
+        answer = self.ask(bytes((command,)) + self.multiplexer + size)
         assert answer[:4] == b"\xa4" + self.multiplexer
-        block_size, done, rounds = answer[4], 0, 0
+        block_size = answer[4]
+        done = 0
+        rounds = 0
         parts = [data[at : at + 7] for at in range(0, len(data), 7)] or [b""]
         while done < len(parts):
             rounds += 1
             block = parts[done : done + block_size]
-            received, whole = 0, True
+            received = 0
+            whole = True
             for number, part in enumerate(block[:-1], 1):
                 if self.lose():
                     whole = False
@@ -120,10 +138,13 @@ class Client:
                 received += whole
                 for answer in self.bench.request(bytes((number,)) + part):
                     raise Refused(answer)
-            # the segment that closes a sub-block has to arrive: without it there is no acknowledgement
-            end = done + len(block) == len(parts)
-            answer = self.ask(bytes((len(block) | end << 7,)) + block[-1].ljust(7, b"\xee"))
-            assert answer[0] == 0xA2 and answer[1] == received + whole and not any(answer[3:])
+            # The last segment of a sub-block has to arrive. Without it there is no acknowledgement.
+            is_last = done + len(block) == len(parts)
+            command = len(block) | is_last << 7
+            answer = self.ask(bytes((command,)) + block[-1].ljust(7, b"\xee"))
+            assert answer[0] == 0xA2
+            assert answer[1] == received + whole
+            assert not any(answer[3:])
             done += answer[1]
             block_size = answer[2]
         unused = 7 - len(parts[-1])
@@ -131,17 +152,22 @@ class Client:
         assert self.ask(bytes((0xC1 | unused << 2,)) + crc) == b"\xa1" + bytes(7)
         return rounds
 
-    def block_upload(self, block_sizes: Sequence[int], with_crc: bool, threshold: int = 0) -> bytes:
+    def block_upload(
+        self,
+        block_sizes: Sequence[int],
+        with_crc: bool,
+        threshold: int = 0,
+    ) -> bytes:
         turn = 0
-        answer = self.ask(
-            bytes((0xA0 | with_crc << 2,)) + self.multiplexer + bytes((block_sizes[0], threshold)),
-        )
+        initiate = bytes((0xA0 | with_crc << 2,)) + self.multiplexer
+        answer = self.ask(initiate + bytes((block_sizes[0], threshold)))
         assert answer[1:4] == self.multiplexer
         if answer[0] & 0xE0 == 0x40:
             return uploaded(self.answer, answer)
         assert answer[0] == 0xC6
         size = int.from_bytes(answer[4:], "little")
-        data, over = b"", False
+        data = b""
+        over = False
         request = b"\xa3"
         while not over:
             block_size = block_sizes[turn % len(block_sizes)]
@@ -162,7 +188,8 @@ class Client:
         assert answer[0] & 0xE3 == 0xC1
         data = data[: len(data) - (answer[0] >> 2 & 7)]
         assert len(data) == size
-        assert int.from_bytes(answer[1:3], "little") == (crc_hqx(data, 0) if with_crc else 0)
+        crc = crc_hqx(data, 0) if with_crc else 0
+        assert int.from_bytes(answer[1:3], "little") == crc
         assert self.bench.request(b"\xa1" + bytes(7)) == []
         return data
 
@@ -173,7 +200,9 @@ SIZES = st.one_of(
     st.integers(0, 2000),
 )
 DATA = st.builds(
-    lambda size, seed: random.Random(seed).randbytes(size), SIZES, st.integers(0, 2**32)
+    lambda size, seed: random.Random(seed).randbytes(size),
+    SIZES,
+    st.integers(0, 2**32),
 )
 
 
@@ -193,7 +222,7 @@ def losing(seed: int, percent: int) -> Callable[[], bool]:
     st.sampled_from([0, 0, 3, 4, 20, 255]),
 )
 @example(b"", [1], True, True, 0, 0, 255)
-def test_blocks_carry_any_data_both_ways_though_segments_get_lost(
+def test_blocks_transfer_any_data_both_ways_even_if_segments_are_lost(
     data: bytes,
     block_sizes: list[int],
     tell_size: bool,
@@ -212,7 +241,7 @@ def test_blocks_carry_any_data_both_ways_though_segments_get_lost(
 
 
 @pytest.mark.parametrize("in_blocks", [True, False])
-def test_a_download_to_the_largest_object_ends_at_64_kib(in_blocks: bool) -> None:
+def test_a_download_of_more_than_64_kib_is_refused(in_blocks: bool) -> None:
     def write(client: Client, data: bytes) -> None:
         if in_blocks:
             client.block_download(data, tell_size=False, with_crc=False)
@@ -231,15 +260,20 @@ def test_a_download_to_the_largest_object_ends_at_64_kib(in_blocks: bool) -> Non
 
 
 def master(bench: Bench) -> Any:
-    """The SDO client of a node whose other end is the server."""
+    """Return the SDO client of a node. The other end is the server."""
 
-    def exchange(cob_id: int, data: bytes, remote: bool) -> list[tuple[int, bytes]]:
-        assert cob_id == 0x601 and not remote
+    def exchange(
+        cob_id: int,
+        data: bytes,
+        remote: bool,
+    ) -> list[tuple[int, bytes]]:
+        assert cob_id == 0x601
+        assert not remote
         bench.now += MS
         answers = list(bench.request(data))
-        while (due := bench.server.due) < bench.now + 1000 * MS:
+        while bench.server.due < bench.now + 1000 * MS:
             bench.answers = []
-            bench.pass_time(due)
+            bench.pass_time(bench.server.due)
             answers += bench.answers
         return [(0x581, answer) for answer in answers]
 
@@ -249,8 +283,11 @@ def master(bench: Bench) -> Any:
 
 
 @pytest.mark.parametrize("segment_ns", [0, MS // 2])
-@pytest.mark.parametrize("size", [1, 4, 5, 7, 8, 7 * 127, 7 * 127 + 1, 5000])
-def test_the_canopen_package_transfers_in_every_way(size: int, segment_ns: int) -> None:
+@pytest.mark.parametrize(
+    "size",
+    [1, 4, 5, 7, 8, 7 * 127, 7 * 127 + 1, 5000],
+)
+def test_the_canopen_package_can_use_every_kind_of_transfer(size: int, segment_ns: int) -> None:
     data = random.Random(size).randbytes(size)
     bench = Bench(segment_ns)
     sdo = master(bench)
@@ -263,17 +300,18 @@ def test_the_canopen_package_transfers_in_every_way(size: int, segment_ns: int) 
         with sdo.open(0x2003, 0, "wb", size=size, request_crc_support=with_crc, **block) as stream:
             stream.write(data)
         assert bench.objects.downloads[-1] == (0x2003, 0, data)
-        # this client takes "the server supports a CRC" for "there is one", so it has to ask for it
+        # If the server supports a CRC, this client expects one, so it has to request it.
         with sdo.open(0x2003, 0, "rb", block_transfer=True, request_crc_support=True) as stream:
             assert stream.read() == data
     assert not bench.server.busy
 
 
-def test_a_block_upload_that_is_begun_again_and_again_keeps_its_pace() -> None:
-    """A master that has no patience gets no more of the bus."""
+def test_a_block_upload_that_is_restarted_often_keeps_its_pace() -> None:
+    """An impatient master does not get a larger part of the bus."""
     bench = Bench(MS)
     bench.objects.find(0x2003, 0).value = bytes(6000)
-    segments, end = 0, 200 * MS
+    segments = 0
+    end = 200 * MS
     while bench.now < end:
         bench.request(bytes.fromhex("a4032000 7f000000"))
         segments += len(bench.request(bytes.fromhex("a300000000000000")))

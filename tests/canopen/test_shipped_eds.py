@@ -1,5 +1,6 @@
-"""The shipped EDS against the rows of the sheet, the configuration's ranges and rules of fussy readers; what others make of it."""
+"""The shipped EDS agrees with the sheet, the configuration's ranges and strict readers' rules."""
 
+import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields
@@ -20,7 +21,9 @@ from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, 
 
 SHIPPED = Path(__file__).parents[2] / "eds" / "kontronik_esc.eds"
 DATA = SHIPPED.read_bytes()
-U8, U16, U32 = 0x05, 0x06, 0x07
+U8 = 0x05
+U16 = 0x06
+U32 = 0x07
 TYPE_OF_WIRE = {"I": U32, "H": U16, "B": U8, "h": 0x03, "b": 0x02}
 # CiA 303-2: prefix as a power of ten, numerator, denominator
 UNIT_CODES = {"V": 0x260000, "A": 0x040000, "°C": 0x2D0000, "1/min": 0xB44700}
@@ -39,7 +42,7 @@ def entries(shipped: Eds) -> dict[tuple[int, int], Entry]:
 
 
 def title(field: str) -> str:
-    """A field's name as the EDS writes it."""
+    """Return a field's name in the spelling of the EDS."""
     words = field.replace("_", " ").replace("bec", "BEC").replace("pwm", "PWM")
     return words[0].upper() + words[1:]
 
@@ -49,23 +52,19 @@ def extremes() -> dict[str, Row]:
     return {name: rows(InfoData)[name] for name in names}
 
 
-# --- the text -------------------------------------------------------------------------------------------------------
+# --- the text
 
 
-def test_names_are_unique_over_the_file_and_of_two_characters_or_more(shipped: Eds) -> None:
-    names = [
-        line.split("=", 1)[1]
-        for line in SHIPPED_TEXT.split("\r\n")
-        if line.startswith("ParameterName=")
-    ]
+def test_names_are_unique_in_the_file_and_have_at_least_two_characters(shipped: Eds) -> None:
+    names = re.findall("^ParameterName=(.*)\r$", SHIPPED_TEXT, re.MULTILINE)
     assert [name for name, count in Counter(names).items() if count > 1] == []
     assert min(map(len, names)) >= 2
-    assert {entry.name for entry in shipped.entries} | set(shipped.object_names.values()) == set(
-        names
-    )
+    read = {entry.name for entry in shipped.entries}
+    read |= set(shipped.object_names.values())
+    assert read == set(names)
 
 
-# --- the objects ----------------------------------------------------------------------------------------------------
+# --- the objects
 
 
 @pytest.mark.parametrize(
@@ -73,8 +72,10 @@ def test_names_are_unique_over_the_file_and_of_two_characters_or_more(shipped: E
     [(0x2000, LiveData), (0x2011, InfoData)],
     ids=["live frame", "logged extremes"],
 )
-def test_fields_stand_in_wire_order_with_their_types(
-    entries: dict[tuple[int, int], Entry], index: int, data: DataType
+def test_fields_are_in_wire_order_and_have_their_types(
+    entries: dict[tuple[int, int], Entry],
+    index: int,
+    data: DataType,
 ) -> None:
     fields_of_frame = rows(LiveData) if data is LiveData else extremes()
     assert max(sub for at, sub in entries if at == index) == len(fields_of_frame)
@@ -83,16 +84,20 @@ def test_fields_stand_in_wire_order_with_their_types(
         expected = title(name).replace("Max ", "Maximum ").replace("Min ", "Minimum ")
         assert entry.name == expected
         assert entry.data_type == TYPE_OF_WIRE[row.wire], name
-        assert (entry.access, entry.mappable) == ("ro", True)
-        assert (entry.low, entry.high, entry.default) == (None, None, 0)
+        assert entry.access == "ro"
+        assert entry.mappable
+        assert entry.low is None
+        assert entry.high is None
+        assert entry.default == 0
 
 
-def test_unit_codes_agree_with_the_field_table(entries: dict[tuple[int, int], Entry]) -> None:
+def test_unit_codes_agree_with_the_table_of_fields(entries: dict[tuple[int, int], Entry]) -> None:
     for sub, (name, row) in enumerate(rows(LiveData).items(), 1):
         entry = entries[0x2002, sub]
-        assert (entry.access, entry.data_type) == ("const", U32)
+        assert entry.access == "const"
+        assert entry.data_type == U32
         assert entry.name.lower() == f"unit of {title(name).lower()}"
-        if row.unit == "mAh":  # no code: 3.6 C
+        if row.unit == "mAh":  # 3.6 C has no code
             assert entry.default == 0
             continue
         power = PREFIX.get(row.unit, 0) - (len(str(row.per_unit)) - 1)
@@ -100,39 +105,46 @@ def test_unit_codes_agree_with_the_field_table(entries: dict[tuple[int, int], En
 
 
 @pytest.mark.parametrize(
-    ("sub", "key"), [(1, "pole_pairs"), (4, "telemetry_timeout_ms"), (7, "cell_count")]
+    ("sub", "key"),
+    [(1, "pole_pairs"), (4, "telemetry_timeout_ms"), (7, "cell_count")],
 )
 def test_settings_have_the_ranges_and_defaults_of_the_configuration(
-    entries: dict[tuple[int, int], Entry], sub: int, key: str
+    entries: dict[tuple[int, int], Entry],
+    sub: int,
+    key: str,
 ) -> None:
     definition: Any = next(each for each in fields(EscConfig) if each.name == key)
-    entry, allowed = entries[0x2100, sub], definition.metadata["kind"].schema
-    most = {U8: 0xFF, U16: 0xFFFF}[entry.data_type] if entry.high is None else entry.high
-    assert (entry.low or 0, most) == (allowed["minimum"], allowed["maximum"])
+    entry = entries[0x2100, sub]
+    allowed = definition.metadata["kind"].schema
+    most = entry.high
+    if most is None:
+        most = {U8: 0xFF, U16: 0xFFFF}[entry.data_type]
+    assert (entry.low or 0) == allowed["minimum"]
+    assert most == allowed["maximum"]
     assert entry.default == definition.default
 
 
-# --- beside the canopen library -------------------------------------------------------------------------------------
+# --- comparison with the canopen library
 
 
 def variables(dictionary: canopen.ObjectDictionary) -> Iterator[ODVariable]:
-    """All entries that the library has read."""
+    """Yield all entries that the library has read."""
     for item in dictionary.values():
         yield from [item] if isinstance(item, ODVariable) else item.values()
 
 
 def as_bytes(value: object) -> object:
-    """A text as we have it."""
+    """Return a text as bytes, as our reader does. Other values are not changed."""
     return value.encode() if isinstance(value, str) else value
 
 
 def power_on(entry: Entry, node_id: int) -> int | float | bytes | None:
-    """The default of a node."""
+    """Return the default of an entry for a node."""
     return entry.default + node_id if entry.relative else entry.default  # type: ignore[operator]
 
 
 @pytest.mark.parametrize("node_id", [1, 127])
-def test_the_canopen_library_reads_every_entry_as_we_do(shipped: Eds, node_id: int) -> None:
+def test_the_canopen_library_reads_every_entry_like_our_reader(shipped: Eds, node_id: int) -> None:
     dictionary = canopen.import_od(str(SHIPPED), node_id=node_id)
     theirs = {}
     for v in variables(dictionary):
@@ -156,30 +168,34 @@ def test_the_mirrors_can_be_dropped(shipped: Eds, tmp_path: Path) -> None:
     assert dcfchk(file, 1) == ""
 
 
-# --- readers of others ----------------------------------------------------------------------------------------------
+# --- readers of other projects
 
 
 @pytest.mark.parametrize("node_id", [1, 5, 127])
-def test_dcfchk_has_no_finding_in_the_eds_and_in_its_dcf(
-    shipped: Eds, tmp_path: Path, node_id: int
+def test_dcfchk_finds_no_mistake_in_the_eds_and_in_its_dcf(
+    shipped: Eds,
+    tmp_path: Path,
+    node_id: int,
 ) -> None:
-    values = {
-        (entry.index, entry.sub): value
-        for entry in shipped.entries
-        if entry.access != "wo" and (value := power_on(entry, node_id)) is not None
-    }
+    values = {}
+    for entry in shipped.entries:
+        value = power_on(entry, node_id)
+        if entry.access != "wo" and value is not None:
+            values[entry.index, entry.sub] = value
     file = tmp_path / "left.dcf"
-    file.write_bytes(dcf.dcf(shipped, node_id, 250_000, values, "left", "left.dcf").encode("ascii"))
+    text = dcf.dcf(shipped, node_id, 250_000, values, "left", "left.dcf")
+    file.write_bytes(text.encode("ascii"))
     assert dcfchk(SHIPPED, node_id) == dcfchk(file, node_id) == ""
     file.write_bytes(with_key(SHIPPED_TEXT, "2100", "SubNumber", "0x8").encode("ascii"))
     assert "1 extra sub-object(s) for object 0x2100" in dcfchk(file, 1), "it can find something"
 
 
 def test_defaults_fit_their_limits_for_a_node_without_a_node_id(shipped: Eds) -> None:
-    """Lely's dcf2c adds 255 for $NODEID if the file is of no node yet, and warns of an overflow."""
+    """Lely's dcf2c adds 255 for $NODEID in a file without a node, and warns of an overflow."""
     relative = [entry for entry in shipped.entries if entry.relative]
     assert len(relative) > 5
     for entry in relative:
         assert isinstance(entry.default, int)
         _, largest = reader.range_of(entry.data_type)
-        assert entry.default + 255 <= (largest if entry.high is None else entry.high), entry.place
+        high = largest if entry.high is None else entry.high
+        assert entry.default + 255 <= high, entry.place

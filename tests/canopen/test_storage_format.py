@@ -1,4 +1,4 @@
-"""The text of a parameter file: there and back, and nothing damaged passes."""
+"""The text of a parameter file is read as it was written, and a damaged text is refused."""
 
 import json
 import zlib
@@ -22,7 +22,7 @@ TEXT = b"""{"format":"kontronik-can-gw parameters","version":1,"crc32":"%08X"}
 
 
 def with_crc(body: str | bytes, version: object = 1) -> bytes:
-    """A file around any content, with the right CRC-32."""
+    """Return a file with any content and its CRC-32."""
     raw = body.encode() if isinstance(body, str) else body
     return b'{"format":"kontronik-can-gw parameters","version":%s,"crc32":"%08X"}\n%s' % (
         str(version).encode(),
@@ -36,7 +36,7 @@ def content(**changed: Any) -> str:
     return json.dumps(whole, separators=(",", ":")) + "\n"
 
 
-def test_the_text_is_what_the_documentation_says() -> None:
+def test_the_text_agrees_with_the_documentation() -> None:
     body = TEXT.split(b"\n", 1)[1]
     assert encode(SAMPLE) == TEXT % zlib.crc32(body)
     assert decode(TEXT % zlib.crc32(body)) == SAMPLE
@@ -52,19 +52,19 @@ stores = st.builds(
 
 
 @given(stores)
-def test_there_and_back(stored: Stored) -> None:
+def test_any_parameters_are_read_as_they_were_written(stored: Stored) -> None:
     assert decode(encode(stored)) == stored
 
 
 def refused(data: bytes) -> str:
     with pytest.raises(ValueError) as caught:
         decode(data)
-    # a reason of ours, not what a library happened to raise
+    # The reason is ours, not an exception of a library.
     assert type(caught.value) is ValueError
     return str(caught.value)
 
 
-def test_every_damaged_byte_every_truncation_and_every_missing_beginning_is_found() -> None:
+def test_every_damaged_byte_and_every_truncation_is_found() -> None:
     data = encode(Stored(7, {0x101700: b"\xf4\x01"}))
     for place, right in enumerate(data):
         refused(data[:place])
@@ -85,23 +85,33 @@ DAMAGED = [
     (with_crc(content(), version='"1"'), "first line"),
     (with_crc(content()).replace(b"\n", b"\r\n"), "CRC-32"),
 ]
-FORM = "form"  # the reason for all that has the right CRC
+FORM = "form"  # the reason for every content with the right CRC
 OTHER_CONTENT: list[Any] = [
-    b"\xff\xfe\n", "[" * 100_000, "[]\n", '{"node_id":null}\n',
+    b"\xff\xfe\n",
+    "[" * 100_000,
+    "[]\n",
+    '{"node_id":null}\n',
     *(content(node_id=value) for value in (0, 128, True, 5.0, "5")),
-    *(content(communication=value) for value in ({"1017": "00"}, {"1018:00": "00", "1017:00": "00"})),
+    content(communication={"1017": "00"}),
+    content(communication={"1018:00": "00", "1017:00": "00"}),
     *(content(communication={key: "00"}) for key in ("1017:00\n", "1a00:00", "2000:00", "0FFF:00")),
     *(content(communication={"1017:00": value}) for value in (5, "f4", "F4 01")),
-    *(content(more=1), content(communication=[]), content(application=None), content(application={"1FFF:FF": "00"})),
-    *(content().replace("{}", '{"1017:00":"00","1017:00":"01"}', 1), content().replace(",", ", ")),
+    content(more=1),
+    content(communication=[]),
+    content(application=None),
+    content(application={"1FFF:FF": "00"}),
+    content().replace("{}", '{"1017:00":"00","1017:00":"01"}', 1),
+    content().replace(",", ", "),
     content().rstrip("\n"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("data", "reason"), [*DAMAGED, *((with_crc(body), FORM) for body in OTHER_CONTENT)]
+    ("data", "reason"),
+    [*DAMAGED, *((with_crc(body), FORM) for body in OTHER_CONTENT)],
 )
-def test_what_this_version_does_not_write_is_refused_with_the_reason(
-    data: bytes, reason: str
+def test_text_that_this_version_does_not_write_is_refused_with_the_reason(
+    data: bytes,
+    reason: str,
 ) -> None:
     assert reason in refused(data)

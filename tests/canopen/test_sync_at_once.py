@@ -1,4 +1,4 @@
-"""SYNCs that are read at once: each counts, and 2021h:7 counts the PDOs that a newer one replaced."""
+"""Each SYNC of several read at once counts. 2021h:7 counts PDOs that a newer one replaced."""
 
 import pytest
 from dialogue import NO_HEARTBEAT, QUIET, Bench, live, tpdo
@@ -13,12 +13,12 @@ LIVE_COUNTER = 0x20200208
 
 
 def synced(kind: int, *mapped: int) -> Bench:
-    """A started node whose only TPDO has this transmission type."""
+    """Return a started node whose only TPDO has this transmission type."""
     return Bench(changes={**QUIET, **tpdo(1, kind, 0, 0, *mapped)}).start()
 
 
 def read_at_once(bench: Bench, count: int) -> list[bytes]:
-    """The PDOs that follow ``count`` SYNCs read in one turn of the loop."""
+    """Read ``count`` SYNCs in one turn of the loop. Return the PDOs that follow."""
     for _ in range(count):
         bench.gateway.receive_frame(CanFrame(0x80, b""), bench.now, bench.now)
     bench.gateway.advance(bench.now)
@@ -38,13 +38,13 @@ def read_at_once(bench: Bench, count: int) -> list[bytes]:
         (240, 480, 2, 0),
     ],
 )
-def test_each_sync_counts(kind: int, syncs: int, expected: int, replaced: int) -> None:
+def test_each_sync_read_at_once_counts(kind: int, syncs: int, expected: int, replaced: int) -> None:
     bench = synced(kind, LIVE_COUNTER)
     assert len(read_at_once(bench, syncs)) == expected
     assert bench.number(*REPLACED) == replaced
 
 
-def test_a_count_goes_on_after_syncs_that_were_read_at_once() -> None:
+def test_the_count_continues_after_syncs_that_were_read_at_once() -> None:
     bench = synced(2, LIVE_COUNTER)
     assert len(read_at_once(bench, 3)) == 1
     assert len(read_at_once(bench, 1)) == 1

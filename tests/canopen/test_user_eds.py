@@ -1,5 +1,7 @@
-"""An EDS of a user: a mistake is refused by file, section, key and remedy, all at once; what CiA 306 allows is taken, and what it drops
-behaves as the shipped default.
+"""An EDS of a user.
+
+All its mistakes are reported together, each with file, section, key and remedy. Everything that
+CiA 306 allows is accepted. If it lacks an object, the node behaves as with the shipped default.
 """
 
 import re
@@ -26,22 +28,23 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 
 
 def with_object(content: str, index: int = 0x2200) -> str:
-    """The shipped EDS with one manufacturer object more."""
+    """Return the shipped EDS with a further manufacturer object."""
     return eds_text.with_object(SHIPPED, index, content)
 
 
 def problems(text: str | bytes, *node_ids: int) -> tuple[str, ...]:
-    """What is wrong with an EDS that these nodes (none: 1 and 2) are to have, () for nothing."""
+    """Return the problems of an EDS for these nodes, by default 1 and 2."""
     data = text if isinstance(text, bytes) else text.encode("ascii")
     try:
-        check_eds(reader.load(data, "mine.eds"), shipped_eds(), [EscSettings()], node_ids or (1, 2))
+        eds = reader.load(data, "mine.eds")
+        check_eds(eds, shipped_eds(), [EscSettings()], node_ids or (1, 2))
     except UserError as error:
         return error.problems
     return ()
 
 
 def changed(section: str, old: str, new: str) -> str:
-    """The shipped EDS with what the first three columns of mistakes.txt say."""
+    """Return the shipped EDS, changed by the first three columns of mistakes.txt."""
     if section == "end":
         return f"{SHIPPED}\r\n{new}"
     if section.startswith("object "):
@@ -52,24 +55,33 @@ def changed(section: str, old: str, new: str) -> str:
     heading = f"[{section}]\r\n"
     before, after = SHIPPED.split(heading)
     body, bracket, rest = after.partition("\r\n[")
-    assert old == "*" or old in body
-    return before + heading + (new if old == "*" else body.replace(old, new, 1)) + bracket + rest
+    if old == "*":
+        body = new
+    else:
+        assert old in body
+        body = body.replace(old, new, 1)
+    return before + heading + body + bracket + rest
 
 
 def rows_of(name: str) -> Iterator[Any]:
-    """The rows of a table, each by its number of line."""
-    for number, line in enumerate(
-        Path(__file__).with_name(name).read_text("ascii").splitlines(), 1
-    ):
+    """Yield the rows of a table. The id of a row is its line number."""
+    lines = Path(__file__).with_name(name).read_text("ascii").splitlines()
+    for number, line in enumerate(lines, 1):
         if line and not line.startswith((";", "==")):
-            yield pytest.param(*(cell.strip(" ") for cell in line.split("|")), id=f"line {number}")
+            cells = [cell.strip(" ") for cell in line.split("|")]
+            yield pytest.param(*cells, id=f"line {number}")
 
 
-# --- the file -------------------------------------------------------------------------------------------------------
+# --- the file
 
 
 @pytest.mark.parametrize(("section", "old", "new", "message"), list(rows_of("mistakes.txt")))
-def test_mistakes_by_section_and_key(section: str, old: str, new: str, message: str) -> None:
+def test_a_mistake_is_reported_with_section_and_key(
+    section: str,
+    old: str,
+    new: str,
+    message: str,
+) -> None:
     new = re.sub(r"\{var (0x[0-9A-F]+)\}", lambda match: variable(int(match[1], 16)), new)
     found = problems(changed(section, old.replace("~", "\r\n"), new.replace("~", "\r\n")))
     assert all(problem.startswith("mine.eds: ") for problem in found)
@@ -77,7 +89,7 @@ def test_mistakes_by_section_and_key(section: str, old: str, new: str, message: 
     assert len(found) == 1 or message.startswith("+ ")
 
 
-def test_all_mistakes_are_reported_at_once() -> None:
+def test_all_mistakes_are_reported_together() -> None:
     text = SHIPPED.replace("CompactPDO=0", "CompactPDO=1")
     found = problems(text.replace("AccessType=const", "AccessType=x"))
     more = 1 + SHIPPED.count("AccessType=const") - 20
@@ -95,7 +107,7 @@ OUT_OF_BOUNDS = [
 
 
 @pytest.mark.parametrize(("more", "said"), OUT_OF_BOUNDS, ids=[said for _, said in OUT_OF_BOUNDS])
-def test_an_eds_that_asks_for_too_much_is_refused_shortly(more: str, said: str) -> None:
+def test_an_oversized_eds_is_refused_with_short_messages(more: str, said: str) -> None:
     found = problems(f"{SHIPPED}\n{more}")
     assert any(said in line for line in found), found
     assert all(len(line) < 600 for line in found)
@@ -106,18 +118,20 @@ VALUES = st.sampled_from(["", "-1", "0", "255", "0x1FFFFFFFF", "9" * 30, "[", "$
 
 @settings(max_examples=40, deadline=None)
 @given(st.data())
-def test_a_damaged_file_is_read_or_refused_and_nothing_else(data: st.DataObject) -> None:
+def test_a_damaged_file_is_either_read_or_refused(data: st.DataObject) -> None:
     lines = SHIPPED.split("\r\n")
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(lines) - 1))
-        line, value = lines[at], data.draw(VALUES | st.text())
+        line = lines[at]
+        value = data.draw(VALUES | st.text())
         more = [f"{line.split('=')[0]}={value}"], [value], [f"[{value}]"], [line, "CompactSubObj=2"]
         lines[at : at + 1] = data.draw(st.sampled_from([[], [line] * 2, *more]))
     for problem in problems("\r\n".join(lines).encode("utf-8", "replace")):
-        assert problem.startswith("mine.eds: ") and problem.endswith((".", ";'."))
+        assert problem.startswith("mine.eds: ")
+        assert problem.endswith((".", ";'."))
 
 
-def test_cob_ids_of_one_node_only_and_of_what_is_not_in_the_eds_are_judged() -> None:
+def test_cob_ids_of_one_node_and_of_missing_objects_are_checked() -> None:
     text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080")
     (said,) = problems(dcf.without(text.encode(), {0x1014}), 1)
     assert "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in said
@@ -128,7 +142,7 @@ def test_cob_ids_of_one_node_only_and_of_what_is_not_in_the_eds_are_judged() -> 
     assert problems(SHIPPED, *range(1, 128)) == ()
 
 
-def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -> None:
+def test_a_configured_setting_that_does_not_fit_its_object_is_refused() -> None:
     text = SHIPPED
     for key, value in (("DataType", "0x0005"), ("HighLimit", "0xFF"), ("DefaultValue", "0xFA")):
         text = with_key(text, "2100sub4", key, value)
@@ -139,10 +153,10 @@ def test_a_configured_setting_that_its_object_cannot_hold_is_refused_by_name() -
         check_eds(eds, shipped_eds(), [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
 
 
-# --- what is allowed ------------------------------------------------------------------------------------------------
+# --- allowed content
 
 
-def test_any_case_lf_comments_and_unknown_sections_are_taken() -> None:
+def test_any_case_lf_comments_and_unknown_sections_are_accepted() -> None:
     text = SHIPPED.replace("\r\n", "\n").replace("AccessType=rw", "ACCESSTYPE=RW")
     for old, new in (
         ("[1A00sub", "[1a00Sub"),
@@ -159,29 +173,42 @@ def test_any_case_lf_comments_and_unknown_sections_are_taken() -> None:
 
 
 def entry_2200(content: str) -> Entry:
-    """A variable of an EDS that is accepted."""
+    """Return the variable 2200h of an EDS that is accepted."""
     eds = reader.load(with_object(content).encode("ascii"), "mine.eds")
     return next(entry for entry in eds.entries if entry.index == 0x2200)
 
 
 @pytest.mark.parametrize(("data_type", "text", "read", "written"), list(rows_of("values.txt")))
-def test_values_of_every_type_as_an_eds_and_a_dcf_write_them(
-    data_type: str, text: str, read: str, written: str
+def test_values_of_every_type_are_read_from_an_eds_and_written_to_a_dcf(
+    data_type: str,
+    text: str,
+    read: str,
+    written: str,
 ) -> None:
-    eds = reader.load(
-        with_object(variable(int(data_type, 16), DefaultValue=text)).encode("ascii"), "mine.eds"
-    )
+    content = variable(int(data_type, 16), DefaultValue=text)
+    eds = reader.load(with_object(content).encode("ascii"), "mine.eds")
     entry = next(entry for entry in eds.entries if entry.index == 0x2200)
-    assert repr(entry.default) + (" + node-ID" if entry.relative else "") == read
+    shown = repr(entry.default)
+    if entry.relative:
+        shown += " + node-ID"
+    assert shown == read
     assert entry.default is not None
-    text = dcf.dcf(eds, 1, 500_000, {(0x2200, 0): entry.default}, "left", "left.dcf")
-    assert re.findall("(?m)^ParameterValue=(.*)\r$", text) == ([written] if written != "-" else [])
+    text = dcf.dcf(
+        eds,
+        1,
+        500_000,
+        {(0x2200, 0): entry.default},
+        "left",
+        "left.dcf",
+    )
+    expected = [written] if written != "-" else []
+    assert re.findall("(?m)^ParameterValue=(.*)\r$", text) == expected
 
 
 EMPTY = dict.fromkeys(("ObjectType", "LowLimit", "HighLimit", "DefaultValue", "PDOMapping"), "")
 
 
-def test_signed_limits_in_twos_complement_and_keys_without_a_value() -> None:
+def test_signed_limits_and_keys_without_a_value_are_read() -> None:
     signed = {"LowLimit": "0x9C", "HighLimit": "0x64", "DefaultValue": "-100"}
     for data_type, keys, wanted in (
         (0x02, signed, (-100, 100, -100)),
@@ -191,19 +218,34 @@ def test_signed_limits_in_twos_complement_and_keys_without_a_value() -> None:
         assert (entry.low, entry.high, entry.default, entry.mappable) == (*wanted, False)
 
 
-# --- the DCF --------------------------------------------------------------------------------------------------------
+# --- the DCF
 
 
-@pytest.mark.parametrize("value", ["Gaß".encode("latin-1"), b"a\r\nb", b" a", b"a ; b", b"a\x00"])
-def test_a_text_that_a_dcf_cannot_hold_is_named(value: bytes) -> None:
+@pytest.mark.parametrize(
+    "value",
+    [
+        "Gaß".encode("latin-1"),
+        b"a\r\nb",
+        b" a",
+        b"a ; b",
+        b"a\x00",
+    ],
+)
+def test_a_text_that_a_dcf_cannot_contain_is_refused(value: bytes) -> None:
     eds = reader.load(SHIPPED.encode(), "kontronik_esc.eds")
-    with pytest.raises(
-        UserError, match=r"kontronik_esc\.eds: 2010h:06 the text .* of Device name cannot stand"
-    ):
-        dcf.dcf(eds, 1, 500_000, {(0x2010, 6): value}, "left", "left.dcf")
+    expected = r"kontronik_esc\.eds: 2010h:06 the text .* of Device name cannot stand"
+    with pytest.raises(UserError, match=expected):
+        dcf.dcf(
+            eds,
+            1,
+            500_000,
+            {(0x2010, 6): value},
+            "left",
+            "left.dcf",
+        )
 
 
-# --- what is dropped -------------------------------------------------------------------------------------------------
+# --- dropped objects
 
 DATA = SHIPPED.encode()
 PDOS = frozenset(range(0x1800, 0x1C00))
@@ -215,20 +257,20 @@ LSS_INQUIRY = ("5A", "5B", "5C", "5D", "5E")
 
 
 def pdos_with(index: int) -> frozenset[int]:
-    """The objects of PDOs that map something of an object: they go with it."""
-    return frozenset(
-        entry.index + offset
-        for entry in shipped_eds().entries
-        if entry.index >> 9 == 0x1A00 >> 9
-        and entry.sub
-        and isinstance(entry.default, int)
-        and entry.default >> 16 == index
-        for offset in (0, -0x200)
-    )
+    """Return the objects of PDOs that map a part of this object. They are dropped with it."""
+    found = set()
+    for entry in shipped_eds().entries:
+        is_mapping = entry.index >> 9 == 0x1A00 >> 9 and entry.sub
+        if is_mapping and isinstance(entry.default, int) and entry.default >> 16 == index:
+            found |= {entry.index, entry.index - 0x200}
+    return frozenset(found)
 
 
 def behaviour(dropped: frozenset[int], self_start: bool = False) -> list[str]:
-    """What a node says, with its times, to a session in which every service has something to do. No SDO: that shows what is there."""
+    """Return the frames of a node with their times, in a session that uses every service.
+
+    SDO is not used, because it would show which objects exist.
+    """
     eds = changed_eds(reader.load(dcf.without(DATA, dropped), "my.eds"), EVERY_SYNC)
     check_eds(eds, shipped_eds(), [EscSettings()])
     bench = Bench(eds=eds, boot=False, self_start=self_start)
@@ -244,7 +286,7 @@ def behaviour(dropped: frozenset[int], self_start: bool = False) -> list[str]:
             bench.put(0x080, b"" if number != 21 else b"\x01")
         if number % 9 == 0:
             bench.put(0x702, "05")
-    bench.wait(1500)  # heartbeats; telemetry is lost
+    bench.wait(1500)  # heartbeats are sent, and telemetry is lost
     bench.uart(live()[:-1] + b"\xff")
     bench.uart(live())
     for name in ("BUS_OFF", "ERROR_ACTIVE"):
@@ -268,33 +310,32 @@ def whole(dropped: frozenset[int] = frozenset()) -> list[str]:
 
 
 @pytest.mark.parametrize("index", OPTIONAL, ids=lambda index: f"{index:04X}h")
-def test_a_dropped_object_leaves_the_behaviour_of_the_shipped_default(index: int) -> None:
+def test_without_an_object_a_node_behaves_as_with_the_shipped_default(index: int) -> None:
     pdos = pdos_with(index)
     assert behaviour(pdos | {index}) == whole(pdos)
 
 
-def test_all_dropped_at_once_leave_it_too() -> None:
+def test_without_all_optional_objects_a_node_behaves_the_same() -> None:
     pdos = frozenset(index for index in shipped_eds().object_names if index in PDOS)
-    assert behaviour(frozenset(OPTIONAL) | pdos) == whole(pdos)
-    assert behaviour(frozenset(OPTIONAL) | pdos, self_start=True) == behaviour(
-        pdos, self_start=True
-    )
+    dropped = frozenset(OPTIONAL) | pdos
+    assert behaviour(dropped) == whole(pdos)
+    assert behaviour(dropped, self_start=True) == behaviour(pdos, self_start=True)
 
 
 @pytest.mark.parametrize("number", range(6))
-def test_only_the_objects_of_a_pdo_take_it_away(number: int) -> None:
+def test_a_pdo_is_missing_only_without_its_own_objects(number: int) -> None:
     left = [line for line in whole() if line.split()[1] != f"{number + 1}81"]
     assert behaviour(frozenset({0x1800 + number, 0x1A00 + number})) == left
 
 
-def test_the_session_hears_every_service() -> None:
+def test_the_session_receives_frames_of_every_service() -> None:
     heard = {line.split()[1] for line in whole()}
     assert heard == {"701", "081", "181", "281", "381", "481", "7E4"}
     codes = {line.split()[2][:4] for line in whole() if line.split()[1] == "081"}
     assert codes == {"0000", "2032", "4081", "4082", "1075"}
 
 
-# --- what editors on Windows write ----------------------------------------------------------------------------------
+# --- files of editors on Windows
 
 LATIN = SHIPPED.replace(
     "ParameterName=Battery voltage", "ParameterName=Akkuspannung gr\u00f6\u00dfer 5\u00b0"
@@ -316,42 +357,50 @@ LATIN = SHIPPED.replace(
         pytest.param(LATIN.encode("utf-8-sig").replace(b"\r\n", b"\r") + b"\x1a", id="all at once"),
     ],
 )
-def test_files_of_windows_editors_give_the_same_node(data: bytes) -> None:
+def test_files_of_windows_editors_result_in_the_same_node(data: bytes) -> None:
     assert problems(data) == ()
     eds = reader.load(data, "mine.eds")
     assert eds.data == data
     plain = shipped_eds().entries
     names = {entry.name for entry in eds.entries} - {entry.name for entry in plain}
     assert names <= {"Akkuspannung grosser 5deg"}
-    assert [replace(entry, name="") for entry in eds.entries] == [
-        replace(entry, name="") for entry in plain
-    ]
+    without_names = [replace(entry, name="") for entry in eds.entries]
+    assert without_names == [replace(entry, name="") for entry in plain]
 
 
 def test_a_dcf_of_a_file_with_other_letters_is_ascii() -> None:
     data = LATIN.encode("latin-1")
-    text = dcf.dcf(reader.load(data, "mine.eds"), 1, 250_000, {}, "left", "left.dcf")
+    text = dcf.dcf(
+        reader.load(data, "mine.eds"),
+        1,
+        250_000,
+        {},
+        "left",
+        "left.dcf",
+    )
     assert text.isascii()
     assert "ParameterName=Akkuspannung grosser 5deg" in text
     assert problems(dcf.without(data, {0x606C})) == ()
 
 
 @pytest.mark.parametrize("coding", ["latin-1", "utf-8-sig", "utf-16"])
-def test_a_mistake_in_a_file_of_a_windows_editor_is_one_line(coding: str) -> None:
+def test_a_mistake_in_a_file_of_a_windows_editor_is_reported_in_one_line(coding: str) -> None:
     text = LATIN.replace("LowLimit=0x01", "LowLimit=\u00fcbel", 1).replace("\r\n", "\r")
     (found,) = problems((text + "\x1a").encode(coding))
-    assert found.startswith("mine.eds: [") and "LowLimit=ubel: not a number" in found
+    assert found.startswith("mine.eds: [")
+    assert "LowLimit=ubel: not a number" in found
 
 
 def test_a_default_text_with_other_letters_is_refused() -> None:
     text = with_object(variable(9, DefaultValue="Gr\u00fc\u00dfe"))
     (found,) = problems(text.encode("latin-1"))
     assert found == (
-        "mine.eds: [2200] DefaultValue=Gr\\xfc\\xdfe has letters beyond ASCII. Write it in plain letters."
+        "mine.eds: [2200] DefaultValue=Gr\\xfc\\xdfe has letters beyond ASCII. "
+        "Write it in plain letters."
     )
 
 
-def test_a_key_with_other_letters_is_no_known_key() -> None:
+def test_a_key_with_other_letters_is_unknown() -> None:
     text = with_object(variable(5).replace("AccessType", "\u00c4ccessType"))
     (found,) = problems(text.encode("latin-1"))
     assert "[2200] AccessType=" in found

@@ -1,4 +1,4 @@
-"""A network for masters of the canopen package, without threads: the answers are there when a request has been sent."""
+"""A network without threads for masters of the canopen package. Answers arrive immediately."""
 
 from collections.abc import Callable, Iterable
 
@@ -9,7 +9,11 @@ Exchange = Callable[[int, bytes, bool], Iterable[tuple[int, bytes]]]
 
 
 class Wire(canopen.Network):
-    """``exchange``: what the other end says to a frame (COB-ID, data, remote), each with its COB-ID."""
+    """A network whose other end is the function ``exchange``.
+
+    ``exchange`` gets COB-ID, data and the remote flag of a frame. It returns COB-ID and data of
+    each answer.
+    """
 
     def __init__(self, exchange: Exchange) -> None:
         super().__init__()
@@ -21,9 +25,13 @@ class Wire(canopen.Network):
 
 
 def wire_to(bench: Bench) -> Wire:
-    """A network on which all nodes of a bench are."""
+    """Return a network with all nodes of a bench."""
 
-    def exchange(cob_id: int, data: bytes, remote: bool) -> list[tuple[int, bytes]]:
+    def exchange(
+        cob_id: int,
+        data: bytes,
+        remote: bool,
+    ) -> list[tuple[int, bytes]]:
         bench.put(cob_id, data, remote=remote)
         bench.answer_saves()
         return [(frame.can_id, frame.data) for frame in bench.take()]

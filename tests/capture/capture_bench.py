@@ -1,4 +1,7 @@
-"""A gateway that is recorded while random things happen to it, without a clock: what it sent, and the entries."""
+"""A recorded gateway without a clock. Random events happen to it.
+
+The bench has the frames that it sent, and the entries of the recording.
+"""
 
 import random
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +37,10 @@ def made(
     dronecan: Mapping[str, object] | None = None,
     **dbc: object,
 ) -> tuple[CaptureSetup, Layout]:
-    """A gateway's making, and the layout of what it sends. ``of_esc``: the configuration of each ESC but for its port."""
+    """Return the setup of a gateway and the layout of its messages.
+
+    ``of_esc`` returns the configuration of an ESC without its port.
+    """
     tables: dict[str, object] = {
         "can": {"interface": "virtual"},
         "dbc": dbc,
@@ -48,7 +54,11 @@ def made(
 
 @dataclass
 class Bench:
-    """``entries``: as recorded; ``sent``: what the live gateway handed to an interface that takes everything."""
+    """A recorded gateway.
+
+    ``entries`` has the recorded entries. ``sent`` has the frames that the live gateway sent on an
+    interface that takes everything.
+    """
 
     setup: CaptureSetup
     layout: Layout
@@ -69,7 +79,13 @@ class Bench:
         self._is_open = True
 
     def _put(
-        self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None
+        self,
+        time_ns: int,
+        kind: int,
+        esc: int,
+        data: bytes,
+        flags: int,
+        came_ns: int | None,
     ) -> None:
         self.entries.append(Entry(time_ns, kind, esc, data, flags, came_ns))
 
@@ -83,25 +99,34 @@ class Bench:
         self._saves += [esc for esc, _ in self.gateway.take_saves()]
 
     def live(self, seed: int, seconds: float, wild: bool = True) -> "Bench":
-        """Run: bytes in random pieces, turns that come late, the bus and the ports go and come, a master asks."""
+        """Run for a time with random events, and end.
+
+        Bytes arrive in random pieces, turns are late, the bus and the ports fail and return, and a
+        master sends requests.
+        """
         now = self.running(seed, wild)(seconds)
         self.gateway.stop(now)
         self.take(now)
         return self
 
-    def running(self, seed: int, wild: bool = True) -> Callable[[float], int]:
-        """The gateway has started; what lets it run for so many seconds, and returns the time."""
+    def running(
+        self,
+        seed: int,
+        wild: bool = True,
+    ) -> Callable[[float], int]:
+        """Start the gateway. Return a function that runs it for a number of seconds.
+
+        The function returns the time after that.
+        """
         rng = random.Random(seed)
-        gateway, now = self.gateway, START + rng.randrange(MS)
+        gateway = self.gateway
+        now = START + rng.randrange(MS)
         faults = Faults(flipped_bits=0.0005)
-        escs = [
-            SimulatedEsc(
-                EscOptions(device=rng.choice([Device.KOSMIK, Device.JIVEPRO]), faults=faults),
-                seed=rng.randrange(1000),
-                start_ns=now,
-            )
-            for _ in self.setup.escs
-        ]
+        escs = []
+        for _ in self.setup.escs:
+            device = rng.choice([Device.KOSMIK, Device.JIVEPRO])
+            options = EscOptions(device=device, faults=faults)
+            escs.append(SimulatedEsc(options, seed=rng.randrange(1000), start_ns=now))
         for index in range(len(escs)):
             gateway.port(index, True, now)
         gateway.start(now, rng.random() < 0.9)
@@ -133,7 +158,12 @@ class Bench:
 
         return run
 
-    def _happens(self, rng: random.Random, now: int, open_ports: list[bool]) -> None:
+    def _happens(
+        self,
+        rng: random.Random,
+        now: int,
+        open_ports: list[bool],
+    ) -> None:
         gateway = self.gateway
         index = rng.randrange(len(open_ports))
         what = rng.random()
@@ -168,7 +198,7 @@ class Bench:
                 ]
             )
             gateway.status.received_frames += 1
-            if can_id >> 31:  # a block: one of its ids
+            if can_id >> 31:  # one id of a block of ids
                 frame = CanFrame(can_id & 0x1FFFFFFF | rng.randrange(0x80), data, True)
             else:
                 frame = CanFrame(can_id, data)
@@ -176,11 +206,19 @@ class Bench:
 
 
 def capture_file(
-    setup: CaptureSetup, entries: Sequence[Entry], devices: Sequence[str] = (), **more: object
+    setup: CaptureSetup,
+    entries: Sequence[Entry],
+    devices: Sequence[str] = (),
+    **more: object,
 ) -> bytes:
-    """A capture as the recorder writes it. ``devices``: what is learnt of the ESCs at its end; ``more``: of its header."""
+    """Return a capture in the recorder's format.
+
+    ``devices`` are devices of the ESCs that become known at its end. ``more`` has further keys of
+    its header.
+    """
     header = setup.header() | {"run": "r", "part": 0, "created_ns": START, "monotonic_ns": START}
-    blocks = [(b"H", json_payload(header | {"wall_ns": 1_700_000_000 * SECOND} | more))]
+    header |= {"wall_ns": 1_700_000_000 * SECOND} | more
+    blocks = [(b"H", json_payload(header))]
     for at in range(0, len(entries), 300):
         blocks.append((b"D", data_payload(entries[at : at + 300])))
     if devices:
@@ -191,7 +229,12 @@ def capture_file(
     return b"".join(block(kind, number, data) for number, (kind, data) in enumerate(blocks))
 
 
-def capture(path: Path, setup: CaptureSetup, entries: Sequence[Entry], **more: object) -> Path:
-    """A ``capture_file`` at ``path``."""
+def capture(
+    path: Path,
+    setup: CaptureSetup,
+    entries: Sequence[Entry],
+    **more: object,
+) -> Path:
+    """Write a ``capture_file``. Return its path."""
     path.write_bytes(capture_file(setup, entries, **more))  # type: ignore[arg-type]
     return path

@@ -1,6 +1,8 @@
-"""The capture's format: every entry comes back, every intact block is found, damage is reported and costs nothing else.
+"""The format of captures.
 
-With right checksums and wrong contents: one line, or what makes sense; never another exception, nor a hang.
+Every entry is read as it was written, every intact block is found, and damage is reported without
+further losses. If the content is wrong although the checksum is right, the sensible part is read,
+or one line reports the reason. No other exception and no hang may occur.
 """
 
 import copy
@@ -63,7 +65,7 @@ def scanned(data: bytes, size: int | None = None) -> list[Block | Damage]:
 
 
 @given(st.lists(entries, max_size=20))
-def test_entries_come_back(listed: list[Entry]) -> None:
+def test_entries_are_read_as_they_were_written(listed: list[Entry]) -> None:
     expected = [
         entry if entry.kind in (Kind.BYTES, Kind.FRAME) else entry._replace(came_ns=None)
         for entry in listed
@@ -72,7 +74,7 @@ def test_entries_come_back(listed: list[Entry]) -> None:
 
 
 @given(st.binary(max_size=200))
-def test_rubbish_as_a_table_is_refused_or_read_but_never_more(data: bytes) -> None:
+def test_garbage_in_a_table_is_refused_or_read_exactly(data: bytes) -> None:
     try:
         found = list(read_entries(data))
     except ValueError:
@@ -85,10 +87,13 @@ def test_rubbish_as_a_table_is_refused_or_read_but_never_more(data: bytes) -> No
     st.lists(st.binary(max_size=60), min_size=6, max_size=6),
     st.data(),
 )
-def test_blocks_are_found_amid_rubbish_and_every_byte_is_accounted_for(
-    listed: list[bytes], rubbish: list[bytes], data: st.DataObject
+def test_blocks_are_found_in_garbage_and_every_byte_is_counted(
+    listed: list[bytes],
+    rubbish: list[bytes],
+    data: st.DataObject,
 ) -> None:
-    stream, places = b"", []
+    stream = b""
+    places = []
     for number, payload in enumerate(listed):
         stream += rubbish[number]
         places.append(len(stream))
@@ -99,26 +104,37 @@ def test_blocks_are_found_amid_rubbish_and_every_byte_is_accounted_for(
     assert [(b.offset, b.payload) for b in blocks] == list(zip(places, listed, strict=True))
     assert [b.number for b in blocks] == list(range(len(listed)))
     damaged = sum(d.length for d in found if isinstance(d, Damage))
-    assert damaged == sum(len(rubbish[n]) for n in range(len(listed))) + len(rubbish[-1])
+    written = [*rubbish[: len(listed)], rubbish[-1]]
+    assert damaged == sum(map(len, written))
 
 
-def test_any_flipped_bit_costs_its_block_and_no_other() -> None:
+def test_any_flipped_bit_loses_only_its_own_block() -> None:
     parts = [block(b"D", n, bytes((n,)) * 50) for n in range(3)]
+    assert len({len(part) for part in parts}) == 1
     stream = b"".join(parts)
     rng = random.Random(1)
     for bit in rng.sample(range(len(stream) * 8), 300):
         broken = bytearray(stream)
         broken[bit // 8] ^= 1 << bit % 8
-        hit = next(n for n in range(3) if bit // 8 < sum(map(len, parts[: n + 1])))
+        hit = bit // 8 // len(parts[0])
         found = scanned(bytes(broken), 64)
         assert {b.number for b in found if isinstance(b, Block)} == {0, 1, 2} - {hit}
         assert [d.length for d in found if isinstance(d, Damage)] == [len(parts[hit])]
 
 
-def test_a_block_that_claims_to_be_huge_is_none() -> None:
-    """A deflated bomb, or a length from rubbish, must not make the reader wait or swell."""
+def test_a_block_with_a_huge_claimed_length_is_refused() -> None:
+    """A compressed bomb, or a length from garbage, must not cost the reader time or memory."""
     packed = zlib.compress(bytes(1 << 22), 9)
-    head = struct.pack("<4scBHIII", MAGIC, b"D", 1, 0, len(packed), 1000, 0)
+    head = struct.pack(
+        "<4scBHIII",
+        MAGIC,
+        b"D",
+        1,
+        0,
+        len(packed),
+        1000,
+        0,
+    )
     bomb = head + struct.pack("<I", zlib.crc32(packed, zlib.crc32(head))) + packed
     good = block(b"D", 1, b"good")
     found = scanned(bomb + good)
@@ -137,7 +153,7 @@ def test_a_block_that_claims_to_be_huge_is_none() -> None:
         queued=st.just(False),
     )
 )
-def test_a_can_frame_comes_back(frame: CanFrame) -> None:
+def test_a_can_frame_is_read_as_it_was_written(frame: CanFrame) -> None:
     assert read_frame(frame_data(frame)) == frame
 
 
@@ -151,8 +167,24 @@ def test_data_that_is_too_short_is_refused(read: Callable[[bytes], object]) -> N
 
 
 VALUES: tuple[Any, ...] = (
-    *(None, 0, -1, 10**30, 1.5, 1e308, float("inf"), float("nan"), True, [], [1], {}, {"a": 1}),
-    *("", "x", "1/0", "1e9999", "9" * 5000),
+    None,
+    0,
+    -1,
+    10**30,
+    1.5,
+    1e308,
+    float("inf"),
+    float("nan"),
+    True,
+    [],
+    [1],
+    {},
+    {"a": 1},
+    "",
+    "x",
+    "1/0",
+    "1e9999",
+    "9" * 5000,
 )
 GONE = object()
 
@@ -176,11 +208,12 @@ def header(bench: Bench) -> dict[str, Any]:
 
 
 def places(found: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Every place in a JSON document."""
+    """Yield the path of every value in a JSON document."""
     yield path
     children = dict(enumerate(found)) if isinstance(found, list) else found
-    for key in children if isinstance(children, dict) else ():
-        yield from places(found[key], (*path, key))
+    if isinstance(children, dict):
+        for key, child in children.items():
+            yield from places(child, (*path, key))
 
 
 def changed(document: Any, path: tuple[Any, ...], value: Any) -> Any:
@@ -198,7 +231,7 @@ def changed(document: Any, path: tuple[Any, ...], value: Any) -> Any:
 
 
 def read_all(path: Path) -> None:
-    """Everything that is read of a capture; only our own errors may come."""
+    """Read everything of a capture. Only our own errors may occur."""
     lines: tuple[str, ...] = ("read",)
     try:
         with open_input(path) as found:
@@ -214,12 +247,16 @@ def read_all(path: Path) -> None:
             assert len(found.damage) < 100
     except (UserError, RunError) as error:
         lines = error.problems
-    assert lines and all(line.isprintable() for line in lines)
+    assert lines
+    assert all(line.isprintable() for line in lines)
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_wrong_header_values(
-    seed: int, header: dict[str, Any], bench: Bench, tmp_path: Path
+def test_wrong_header_values_cause_only_our_own_errors(
+    seed: int,
+    header: dict[str, Any],
+    bench: Bench,
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.kcap"
     data = block(b"D", 1, data_payload(bench.entries[:40])) + block(b"E", 2, b"")
@@ -237,7 +274,7 @@ PYTHON = re.compile(
     r"codec can't|' object|NoneType|subscript|invalid literal|unhashable|has no attribute|must be|"
     r"unpack|argument|fromhex|\bint\(|\bstr\b|\bdict\b|indices|Expecting|not iterable|expected"
 )
-"""Words of Python's own errors."""
+"""Words in Python's own error messages."""
 
 
 def test_a_refused_header_is_described_in_words_for_users(header: dict[str, Any]) -> None:
@@ -268,7 +305,11 @@ def test_a_refused_header_is_described_in_words_for_users(header: dict[str, Any]
     ],
 )
 def test_a_refused_header_names_its_part(
-    header: dict[str, Any], place: tuple[Any, ...], value: Any, said: str, tmp_path: Path
+    header: dict[str, Any],
+    place: tuple[Any, ...],
+    value: Any,
+    said: str,
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.kcap"
     path.write_bytes(block(b"H", 0, json_payload(changed(header, place, value))))
@@ -277,8 +318,10 @@ def test_a_refused_header_names_its_part(
     assert refused.value.problems[0].startswith(f"{path}: the header cannot be used: {said}")
 
 
-def test_a_block_that_is_no_json_is_described_without_python(
-    header: dict[str, Any], bench: Bench, tmp_path: Path
+def test_a_block_without_json_is_described_in_words_for_users(
+    header: dict[str, Any],
+    bench: Bench,
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.kcap"
     head = block(b"H", 0, json_payload(header))
@@ -294,7 +337,10 @@ def test_a_block_that_is_no_json_is_described_without_python(
 
 @pytest.mark.parametrize("part", ["x", [], None])
 def test_a_later_part_without_a_number_is_damage(
-    header: dict[str, Any], bench: Bench, tmp_path: Path, part: Any
+    header: dict[str, Any],
+    bench: Bench,
+    tmp_path: Path,
+    part: Any,
 ) -> None:
     data = block(b"D", 1, data_payload(bench.entries[:40]))
     for number, value in enumerate((0, part), 1):
@@ -306,7 +352,11 @@ def test_a_later_part_without_a_number_is_damage(
         assert any("has a part that is no number" in line for line in found.damage)
 
 
-def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
+def test_wrong_entries_cause_only_our_own_errors(
+    header: dict[str, Any],
+    bench: Bench,
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a.kcap"
     rng = random.Random(4)
     for _ in range(10):
@@ -326,22 +376,26 @@ def test_wrong_entries(header: dict[str, Any], bench: Bench, tmp_path: Path) -> 
                     Entry(entry.time_ns, Kind.SAVED),
                 ]
             )
-        path.write_bytes(
-            block(b"H", 0, json_payload(header)) + block(b"D", 1, data_payload(entries))
-        )
+        head = block(b"H", 0, json_payload(header))
+        path.write_bytes(head + block(b"D", 1, data_payload(entries)))
         read_all(path)
 
 
-def test_what_only_looks_like_blocks_costs_little(
+def test_data_that_only_looks_like_blocks_costs_little_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Heads that promise megabytes, one after the other: each would have to be read to its end."""
+    """Many heads promise megabytes, and each would have to be read to its end."""
     head = struct.pack("<4scBHIII", MAGIC, b"D", 0, 0, 8_000_000, 8_000_000, 0) + b"\0\0\0\0"
     data = head * 3000 + bytes(9_000_000)
     costs = [0]
     real = capture._payload
 
-    def counting(buffer: bytearray, deflated: int, stored: int, size: int) -> bytes | None:
+    def counting(
+        buffer: bytearray,
+        deflated: int,
+        stored: int,
+        size: int,
+    ) -> bytes | None:
         costs[0] += stored
         return real(buffer, deflated, stored, size)
 
@@ -350,7 +404,10 @@ def test_what_only_looks_like_blocks_costs_little(
     assert 1 << 27 < costs[0] < 1 << 29, "of 24 GB that are promised"
 
 
-def test_a_file_of_nothing_but_damage_is_summed_up(header: dict[str, Any], tmp_path: Path) -> None:
+def test_damage_of_a_completely_damaged_file_is_summed_up(
+    header: dict[str, Any],
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a.kcap"
     empty = block(b"D", 1, data_payload([]))
     path.write_bytes(block(b"H", 0, json_payload(header)) + (empty + b"x") * 20_000)
@@ -369,8 +426,7 @@ def test_a_header_cannot_forge_lines(header: dict[str, Any], bench: Bench, tmp_p
         with open_input(path) as found:
             assert isinstance(found, CaptureInput)
             assert found.channel == shown
-    path.write_bytes(
-        block(b"H", 0, json_payload(changed(header, ("escs", 0, "name"), "a\nb"))) + entries
-    )
+    forged = changed(header, ("escs", 0, "name"), "a\nb")
+    path.write_bytes(block(b"H", 0, json_payload(forged)) + entries)
     with pytest.raises(UserError, match="header cannot be used"):
         open_input(path)

@@ -1,4 +1,7 @@
-"""Numbers in a capture that no gateway has are rejected, the same with both cores, and none leaves 64 bits in the core in C."""
+"""Numbers in a capture that are impossible for a gateway are rejected by both cores.
+
+They never exceed 64 bits in the C core.
+"""
 
 import struct
 from pathlib import Path
@@ -36,9 +39,7 @@ LIMITS = {
 
 
 @pytest.mark.parametrize("name", LIMITS)
-def test_a_state_that_no_gateway_has_is_refused_in_header_and_entry(
-    name: str, tmp_path: Path
-) -> None:
+def test_an_impossible_state_is_refused_in_header_and_entry(name: str, tmp_path: Path) -> None:
     check_state(_with(name, LIMITS[name]))
     for number in (LIMITS[name] + 1, 1 << 100, -1):
         with pytest.raises(ValueError, match="is not a whole number"):
@@ -49,44 +50,61 @@ def test_a_state_that_no_gateway_has_is_refused_in_header_and_entry(
         pass
 
 
-@pytest.mark.parametrize("started_ns", [END_OF_TIME, (1 << 63) - 1, 1 << 63, (1 << 64) - 1])
-def test_counters_that_no_gateway_has_are_rejected_and_change_nothing(started_ns: int) -> None:
+@pytest.mark.parametrize(
+    "started_ns",
+    [END_OF_TIME, (1 << 63) - 1, 1 << 63, (1 << 64) - 1],
+)
+def test_impossible_counters_are_rejected_and_change_nothing(started_ns: int) -> None:
     bench = Bench(*made(1)).live(1, 0.5)
     counters = [3] * (len(COUNTERS) - 1)
     good = numbers_data(*counters, START - 77)
     now = bench.entries[-1].time_ns
     gateway = bench.setup.gateway(bench.layout, START)
     replay = Replay(gateway)
-    for bad in (numbers_data(*counters, started_ns), numbers_data(*counters[1:], MAX_COUNT, START)):
-        [*replay.follow([Entry(now, Kind.COUNTERS, 0, good), Entry(now, Kind.COUNTERS, 0, bad)])]
+    late_start = numbers_data(*counters, started_ns)
+    high_count = numbers_data(*counters[1:], MAX_COUNT, START)
+    for bad in (late_start, high_count):
+        entries = [Entry(now, Kind.COUNTERS, 0, data) for data in (good, bad)]
+        list(replay.follow(entries))
     assert replay.rejected == 2
     assert gateway.status.started_ns == START - 77
     assert gateway.status.sent_frames == 3
 
 
 @pytest.mark.parametrize("time_ns", [END_OF_TIME, (1 << 63) - 1])
-def test_a_time_that_no_gateway_has_is_rejected(time_ns: int) -> None:
+def test_an_impossible_time_is_rejected(time_ns: int) -> None:
     bench = Bench(*made(1)).live(1, 0.5)
     replay = Replay(bench.setup.gateway(bench.layout, START))
-    [*replay.follow(bench.entries)]
-    [
-        *replay.follow(
-            [Entry(time_ns, Kind.ADVANCE), Entry(START, Kind.BYTES, data=b"K", came_ns=time_ns)]
-        )
+    list(replay.follow(bench.entries))
+    impossible = [
+        Entry(time_ns, Kind.ADVANCE),
+        Entry(START, Kind.BYTES, data=b"K", came_ns=time_ns),
     ]
+    list(replay.follow(impossible))
     assert replay.rejected == 2
 
 
-def test_rows_of_a_capture_with_such_counters_are_those_of_python(
-    native_library: Any, tmp_path: Path
+def test_rows_of_a_capture_with_impossible_counters_are_equal_in_c(
+    native_library: Any,
+    tmp_path: Path,
 ) -> None:
-    """The uptime in a table is computed from ``started_ns``."""
+    """A table's uptime is computed from ``started_ns``."""
     from offline_equality import core
 
     bench = Bench(*made(1)).live(1, 1)
     half = len(bench.entries) // 2
     now = bench.entries[half].time_ns
-    data = struct.pack("<8Q", 9, 9, 9, 9, 9, 9, 9, (1 << 63) - 1)
+    data = struct.pack(
+        "<8Q",
+        9,
+        9,
+        9,
+        9,
+        9,
+        9,
+        9,
+        (1 << 63) - 1,
+    )
     entries = [*bench.entries[:half], Entry(now, Kind.COUNTERS, 0, data), *bench.entries[half:]]
     path = capture(tmp_path / "far.kcap", bench.setup, entries)
     found = []

@@ -1,4 +1,7 @@
-"""Recordings of every kind as rows and frames: rows are what the bus said, times are those of the wire, nothing old is ever shown."""
+"""Rows and frames of every kind of recording.
+
+Rows have the values of the bus and the times of the wire, and never contain old values.
+"""
 
 from itertools import pairwise
 from pathlib import Path
@@ -27,14 +30,16 @@ from kontronik_can_gw.times import MS, SECOND
 
 
 def plain_run(seconds: float, faults: Faults | None = None) -> Bench:
-    """A gateway with an ESC whose frames are read each 5 ms."""
+    """Run a gateway with an ESC whose frames are read every 5 ms."""
     bench = Bench(*made(1))
-    gateway, now = bench.gateway, START
+    gateway = bench.gateway
+    now = START
     esc = SimulatedEsc(EscOptions(faults=faults or Faults()), seed=1, start_ns=START)
     gateway.port(0, True, now)
     gateway.start(now)
     for now in range(START, START + int(seconds * SECOND), 5 * MS):
-        if data := b"".join(sent.wire for sent in esc.frames_until(now)):
+        data = b"".join(sent.wire for sent in esc.frames_until(now))
+        if data:
             gateway.receive_bytes(0, data, now, now)
         gateway.advance(now)
         bench.take(now)
@@ -61,10 +66,12 @@ def test_a_loss_is_a_row_without_values_until_the_next_frame(tmp_path: Path) -> 
         assert 250 * MS <= lost.time_ns - before.time_ns < 300 * MS
 
 
-def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> None:
+def test_rows_of_a_can_log_have_values_while_they_are_fresh(tmp_path: Path) -> None:
     bench = plain_run(6)
-    stop, resume = START + 2 * SECOND, START + 5 * SECOND
-    sent = [(f.time_ns - START, f.frame) for f in bench.sent if not stop < f.time_ns < resume]
+    stop = START + 2 * SECOND
+    resume = START + 5 * SECOND
+    kept = [each for each in bench.sent if not stop < each.time_ns < resume]
+    sent = [(each.time_ns - START, each.frame) for each in kept]
     log = write_log(tmp_path / "a.log", sent, start_s=1_700_000_000)
     with open_input(log) as found:
         assert isinstance(found, CanLogInput)
@@ -73,13 +80,13 @@ def test_rows_of_a_can_log_hold_values_while_they_are_fresh(tmp_path: Path) -> N
         seconds = [(row.time_ns - rows[0].time_ns) / SECOND for row in rows]
         voltages = [row.values[at["battery_voltage"]] for row in rows]
         assert sum(v is not None for v in voltages) > 250
-        assert any(2.0 < after < 4.9 for after in seconds), "the loss has a row of its own"
+        assert any(2.0 < after < 4.9 for after in seconds), "the loss has a separate row"
         pairs = zip(voltages, seconds, strict=True)
         assert {value for value, after in pairs if 3.1 < after < 4.99} <= {None}
         assert found.wall_ns(rows[0].time_ns) == pytest.approx(1_700_000_000 * SECOND, abs=2 * MS)
 
 
-def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:
+def test_a_run_is_selected_by_its_folder_or_the_beginning_of_its_name(tmp_path: Path) -> None:
     bench = plain_run(1)
     with pytest.raises(UserError, match="has no captures"):
         open_input(tmp_path)
@@ -92,8 +99,13 @@ def test_folders_and_beginnings_of_names(tmp_path: Path) -> None:
     with open_input(tmp_path / "20260102") as found:
         assert isinstance(found, CaptureInput)
         assert found.header["run"] == "b"
+    other = tmp_path / "20260102T000000Z-bbbbbb-0001.kcap"
     capture(
-        tmp_path / "20260102T000000Z-bbbbbb-0001.kcap", bench.setup, bench.entries, run="c", part=1
+        other,
+        bench.setup,
+        bench.entries,
+        run="c",
+        part=1,
     )
     with open_input(tmp_path / "20260102") as found, pytest.raises(UserError, match="another run"):
         list(found.samples())
@@ -105,9 +117,8 @@ def test_a_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: P
     capture(tmp_path / "20260101T000000Z-aaaaaa-00001.kcap", bench.setup, bench.entries, part=1)
     with open_input(tmp_path) as found:
         assert len(list(found.samples())) > 50
-        assert (
-            "20260101T000000Z-aaaaaa-00000.kcap: has no header that could be read" in found.damage
-        )
+        expected = "20260101T000000Z-aaaaaa-00000.kcap: has no header that could be read"
+        assert expected in found.damage
 
 
 def byte_entry(time_ns: int) -> Entry:
@@ -115,11 +126,18 @@ def byte_entry(time_ns: int) -> Entry:
 
 
 def clock_entry(time_ns: int, wall_ns: int) -> Entry:
-    return Entry(time_ns, Kind.CLOCK, 0, numbers_data(wall_ns), 0, None)
+    return Entry(
+        time_ns,
+        Kind.CLOCK,
+        0,
+        numbers_data(wall_ns),
+        0,
+        None,
+    )
 
 
-def test_a_clock_that_is_set_counts_from_the_entry_after_it_on(tmp_path: Path) -> None:
-    """And each part of a run begins with the wall clock of its own header."""
+def test_a_changed_wall_clock_applies_to_later_entries(tmp_path: Path) -> None:
+    """Each part of a run begins with the wall clock of its own header."""
     setup = made(1)[0]
     wall = 1_700_000_000 * SECOND
     first = [
@@ -147,15 +165,15 @@ def test_a_clock_that_is_set_counts_from_the_entry_after_it_on(tmp_path: Path) -
     assert walls == [wall, wall + SECOND, wall + 3601 * SECOND, wall + 51 * SECOND]
 
 
-def test_a_capture_without_some_blocks_or_its_end_is_read_and_tells_so(tmp_path: Path) -> None:
-    """Entries never go back in time, whatever a file holds."""
+def test_missing_blocks_and_a_missing_end_of_a_capture_are_reported(tmp_path: Path) -> None:
+    """Times of entries never decrease, even if the times in the file do."""
     header = made(1)[0].header() | {"run": "r", "part": 0, "created_ns": START}
     steps = (3, 2, 7)
-    blocks = [block(b"H", 0, json_payload(header | {"monotonic_ns": START, "wall_ns": START}))]
-    blocks += [
-        block(b"D", number, data_payload([byte_entry(START + step * SECOND)]))
-        for number, step in zip((1, 2, 5), steps, strict=True)
-    ]
+    times_of_start = {"monotonic_ns": START, "wall_ns": START}
+    blocks = [block(b"H", 0, json_payload(header | times_of_start))]
+    for number, step in zip((1, 2, 5), steps, strict=True):
+        payload = data_payload([byte_entry(START + step * SECOND)])
+        blocks.append(block(b"D", number, payload))
     path = tmp_path / "a.kcap"
     path.write_bytes(b"".join(blocks))
     with open_input(path) as found:

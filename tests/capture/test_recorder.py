@@ -1,4 +1,4 @@
-"""The recorder: what it is given is in the files, whatever the disk does, and nobody ever waits for it."""
+"""The recorder never delays its caller, and continues when a failed disk works again."""
 
 import errno
 import os
@@ -24,19 +24,24 @@ HEADER = made(1)[0].header()
 
 
 class Bed:
-    """A recorder whose thread sleeps until the end: ``step`` is its work, on a clock that the test moves."""
+    """A recorder whose thread sleeps until the end. ``step`` does its work at the test's time."""
 
     def __init__(
-        self, folder: Path, wait: bool = False, header: dict[str, Any] = HEADER, **settings: float
+        self,
+        folder: Path,
+        wait: bool = False,
+        header: dict[str, Any] = HEADER,
+        **settings: float,
     ) -> None:
-        self.folder, self.now = folder, 10 * SECOND
+        self.folder = folder
+        self.now = 10 * SECOND
         config = RecordConfig(**{"min_free_mb": 0} | settings)  # type: ignore[arg-type]
         self.it = Recorder(folder, config, lambda: self.now)
         self.it.header = header
         self.it.start(wait)
 
     def step(self, *puts: Entry, after_s: int = 0) -> str:
-        """Let it write these at a later time; its problem by then."""
+        """Write these entries at a later time. Return the recorder's problem after that."""
         self.now += after_s * SECOND
         for entry in puts:
             self.it.put(*entry)
@@ -44,12 +49,16 @@ class Bed:
         return self.it.facts.problem
 
     def closed(self) -> tuple[list[Entry], int, list[bool]]:
-        """At the end: the bytes in the files, how many entries they say are lost, beginnings and ends of problems."""
+        """Close the recorder. Return the entries with bytes, the number of lost ones, the reports.
+
+        A report is True if a problem begins, and False if it ends.
+        """
         self.it.close()
         found = recorded(self.folder)
-        lost = sum(sum(read_numbers(e.data)) for e in found if e.kind == Kind.LOST)
+        with_bytes = [entry for entry in found if entry.kind == Kind.BYTES]
+        losses = [sum(read_numbers(entry.data)) for entry in found if entry.kind == Kind.LOST]
         begins = [report.begins for report in self.it.reports(0)]
-        return [e for e in found if e.kind == Kind.BYTES], lost, begins
+        return with_bytes, sum(losses), begins
 
 
 @pytest.fixture(autouse=True)
@@ -59,14 +68,23 @@ def asleep(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def entries(count: int, since: int = 0) -> list[Entry]:
-    return [
-        Entry(1000 + n, Kind.BYTES, n % 3, bytes((n & 255,)) * (n % 50), n % 2, 900 + n)
-        for n in range(since, since + count)
-    ]
+    found = []
+    for number in range(since, since + count):
+        data = bytes((number & 255,)) * (number % 50)
+        entry = Entry(
+            time_ns=1000 + number,
+            kind=Kind.BYTES,
+            esc=number % 3,
+            data=data,
+            flags=number % 2,
+            came_ns=900 + number,
+        )
+        found.append(entry)
+    return found
 
 
 def recorded(path: Path, damage: str = "") -> list[Entry]:
-    """What is in a folder or file. ``damage``: words that must be said of it."""
+    """Return the entries of a folder or file. Its damage must be reported with ``damage``."""
     with open_input(path) as found:
         assert isinstance(found, CaptureInput)
         every = [entry for entry in found.entries() if entry.kind not in (Kind.CLOCK, Kind.STATE)]
@@ -74,7 +92,7 @@ def recorded(path: Path, damage: str = "") -> list[Entry]:
         return every
 
 
-def test_entries_are_in_the_file_in_order(tmp_path: Path) -> None:
+def test_entries_are_written_in_order(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "captures"
     bed = Bed(folder)
     bed.step(*entries(3000))
@@ -85,10 +103,11 @@ def test_entries_are_in_the_file_in_order(tmp_path: Path) -> None:
     assert bed.it.facts.bytes == file.stat().st_size
 
 
-def test_a_capture_is_named_by_the_utc_of_its_first_entry(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_name_of_a_capture_has_the_utc_of_its_first_entry(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The recorder's clock shows 10 s at that moment, and the entry is nearly 10 s older."""
+    """The recorder's clock is at 10 s, and the entry is nearly 10 s older."""
     clocks = {name: getattr(time, name) for name in ("strftime", "gmtime", "localtime")}
     at = SimpleNamespace(**clocks, time_ns=lambda: 1_700_000_010 * SECOND)
     monkeypatch.setattr(recorder, "time", at)
@@ -99,7 +118,7 @@ def test_a_capture_is_named_by_the_utc_of_its_first_entry(
     assert file.name.startswith("20231114T221320Z-")
 
 
-def test_all_parts_of_a_run_together_replay_as_the_run(tmp_path: Path) -> None:
+def test_all_parts_of_a_run_together_replay_the_run(tmp_path: Path) -> None:
     bench = Bench(*made(2, canopen=True)).live(4, 12)
     header = bench.setup.header() | {"created_ns": START, "state": {}}
     bed = Bed(tmp_path, header=header, part_mb=0.04)
@@ -118,7 +137,7 @@ def test_all_parts_of_a_run_together_replay_as_the_run(tmp_path: Path) -> None:
     recorded(tmp_path, "1 parts of the run in front of it are not given")
 
 
-def test_a_new_part_begins_after_its_time(tmp_path: Path) -> None:
+def test_a_new_part_begins_after_the_configured_time(tmp_path: Path) -> None:
     bed = Bed(tmp_path, part_minutes=1)
     for n in range(3):
         bed.step(*entries(1, n), after_s=31)
@@ -128,10 +147,15 @@ def test_a_new_part_begins_after_its_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("trouble", ["full", "broken", "removed", "no folder"])
-def test_a_disk_that_fails_is_tried_again(
-    trouble: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_writing_to_a_failed_disk_is_tried_again(
+    trouble: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What came meanwhile is counted, what was written before stays; said once as it begins, once when it is over."""
+    """Entries meanwhile are counted as lost, and earlier entries are kept.
+
+    The problem is reported when it begins and when it ends.
+    """
     folder = tmp_path / "captures"
     bed = Bed(folder, min_free_mb=10)
     assert bed.step(*entries(10)) == ""
@@ -166,8 +190,8 @@ def test_a_disk_that_fails_is_tried_again(
         recorded(folder, "was not closed")
 
 
-def test_a_folder_that_cannot_be_used_is_said_at_once_or_waited_for(tmp_path: Path) -> None:
-    """Waited for where devices are."""
+def test_an_unusable_folder_is_refused_or_waited_for(tmp_path: Path) -> None:
+    """With ``wait``, the recorder waits for the folder as it does for devices."""
     (tmp_path / "place").touch()
     with pytest.raises(RunError, match=r"record\.directory"):
         Bed(tmp_path / "place" / "captures")
@@ -178,16 +202,14 @@ def test_a_folder_that_cannot_be_used_is_said_at_once_or_waited_for(tmp_path: Pa
     assert bed.closed() == (entries(3, 3), 3, [True, False])
 
 
-def test_the_oldest_captures_go_and_nothing_else(tmp_path: Path) -> None:
+def test_only_the_oldest_captures_are_removed(tmp_path: Path) -> None:
     for n in range(1, 6):
         (tmp_path / f"2025010{n}T000000Z-abcdef-0000.kcap").write_bytes(bytes(1000))
     others = {"flight.kcap", "20250101T000000Z-abcdef-0000.txt"}
     for name in others:
         (tmp_path / name).write_bytes(bytes(9000))
-    for keep_mb, left in (
-        (0.0025, 5),
-        (0.00001, 3),
-    ):  # each leaves its own, which is closed by the next
+    # Each recorder leaves its own capture, which is closed when the next one runs.
+    for keep_mb, left in ((0.0025, 5), (0.00001, 3)):
         bed = Bed(tmp_path, keep_mb=keep_mb)
         bed.step(*entries(5))
         bed.it.close()
@@ -195,46 +217,54 @@ def test_the_oldest_captures_go_and_nothing_else(tmp_path: Path) -> None:
     assert all((tmp_path / name).exists() for name in others)
 
 
-def test_what_somebody_else_is_writing_stays(tmp_path: Path) -> None:
-    """Two gateways, one folder: the older file is in use."""
+def test_a_capture_that_another_gateway_writes_is_kept(tmp_path: Path) -> None:
+    """Two gateways use one folder, and the older file is still open."""
     first = Bed(tmp_path)
     first.step(*entries(5))
     [in_use] = tmp_path.iterdir()
-    # a clock that was wrong: newest by name, oldest by age
+    # The clock was wrong: this file is the newest by name, but the oldest by age.
     closed = tmp_path / "20990101T000000Z-abcdef-00000.kcap"
     closed.write_bytes(bytes(30_000))
     os.utime(closed, (1, 1))
     second = Bed(tmp_path, keep_mb=0.000001)
     second.step(*entries(5))
-    assert in_use.exists() and not closed.exists()
+    assert in_use.exists()
+    assert not closed.exists()
     second.it.close()
     first.it.close()
 
 
-def test_a_disk_that_stands_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stands, go_on = threading.Event(), threading.Event()
+def test_a_blocked_disk_is_reported_and_lost_entries_are_counted(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    is_blocked = threading.Event()
+    may_continue = threading.Event()
 
     def fdatasync(_fd: int) -> None:
-        stands.set()
-        assert go_on.wait(60)
+        is_blocked.set()
+        assert may_continue.wait(60)
 
     monkeypatch.setattr(os, "fdatasync", fdatasync)
     monkeypatch.setattr(recorder, "PERIOD_S", 0)
     bed = Bed(tmp_path)
-    assert stands.wait(60)
+    assert is_blocked.wait(60)
     for entry in entries(CAPACITY + 500):
         bed.it.put(*entry)
     reports = bed.it.reports(bed.now + 6 * SECOND)
     assert [r.begins for r in reports] == [True, True]
     assert "500 entries" in reports[1].text
     assert "does not answer" in reports[0].text
-    go_on.set()
+    may_continue.set()
     found, lost, begins = bed.closed()
-    assert (len(found), lost, begins) == (CAPACITY, 500, [False])
+    assert len(found) == CAPACITY
+    assert lost == 500
+    assert begins == [False]
 
 
-def test_no_file_is_overwritten_nor_link_followed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_no_file_is_overwritten_and_no_link_is_followed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(os, "urandom", lambda n: bytes(n))
     monkeypatch.setattr(time, "strftime", lambda *_: "20260101T000000Z")
@@ -249,7 +279,7 @@ def test_no_file_is_overwritten_nor_link_followed(
     assert target.read_text() == "precious"
 
 
-def test_a_wall_clock_that_is_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_changed_wall_clock_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shift = 1_700_000_000 * SECOND
     bed = Bed(tmp_path)
     monkeypatch.setattr(time, "time_ns", lambda: bed.now + shift)
@@ -264,7 +294,7 @@ def test_a_wall_clock_that_is_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert walls[1] - walls[0] == 3622 * SECOND
 
 
-def test_a_header_that_is_damaged_is_there_once_more(tmp_path: Path) -> None:
+def test_a_damaged_header_is_replaced_by_its_copy(tmp_path: Path) -> None:
     bed = Bed(tmp_path)
     bed.step(*entries(50))
     bed.step(*entries(50, 50))

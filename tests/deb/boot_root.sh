@@ -1,6 +1,7 @@
 #!/bin/sh
-# Run by in_fresh_roots.py as root in a User Mode Linux: boots the systemd of a Debian root, as it is or read-only with /var in memory.
-# SCRIPT of the output folder runs in it, at the end of the boot.
+# in_fresh_roots.py runs this as root in a User Mode Linux. It boots the systemd of a Debian root,
+# optionally read-only with /var in memory. At the end of the boot it runs SCRIPT of the output
+# folder in the root.
 #   boot_root.sh ROOT OUTPUT-FOLDER SCRIPT [ro]
 set -eu
 root=$1 out=$2 script=$3
@@ -39,10 +40,11 @@ ExecStart=/usr/bin/kontronik-can-gw simulate --link /run/esc1
 ExecStartPost=/bin/sh -c 'until [ -e /run/esc1 ]; do sleep 0.1; done; chown root:dialout /run/esc1; chmod 660 /run/esc1'
 X
 for unit in trial simulator; do ln -s ../$unit.service "$units/multi-user.target.wants/$unit.service"; done
-# what a User Mode Linux or this root does not have
-for unit in dev-hugepages.mount dev-mqueue.mount systemd-remount-fs.service sys-kernel-debug.mount sys-kernel-tracing.mount \
-    sys-kernel-config.mount sys-fs-fuse-connections.mount systemd-firstboot.service systemd-machine-id-commit.service \
-    getty.target systemd-logind.service systemd-networkd.service systemd-timesyncd.service tmp.mount; do
+# units for features that User Mode Linux or this root lacks
+for unit in dev-hugepages.mount dev-mqueue.mount systemd-remount-fs.service sys-kernel-debug.mount \
+    sys-kernel-tracing.mount sys-kernel-config.mount sys-fs-fuse-connections.mount \
+    systemd-firstboot.service systemd-machine-id-commit.service getty.target \
+    systemd-logind.service systemd-networkd.service systemd-timesyncd.service tmp.mount; do
     ln -s /dev/null "$units/$unit"
 done
 exec env container=other unshare --pid --fork --mount --kill-child sh -c '

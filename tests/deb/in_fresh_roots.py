@@ -1,8 +1,9 @@
-"""The Debian packages in fresh roots of both releases: made, installed, upgraded from 0.5.0's way of installing, booted, purged.
+"""The Debian packages in fresh roots of both releases.
 
-A step of `make release` (tests/run.py): python -m pytest tests/deb/in_fresh_roots.py. As root, for debootstrap and chroot. Roots are
-fetched once and kept in tests/deb/.cache; nothing that runs in one has a network. ARM is
-tried with the release's own Python under qemu-user.
+They are built, installed, upgraded from an installation of 0.5.0, booted and purged. This is a step
+of `make release` (tests/run.py): python -m pytest tests/deb/in_fresh_roots.py. It needs root for
+debootstrap and chroot. Roots are downloaded once and kept in tests/deb/.cache. Commands in a root
+have no network. ARM is tried with the release's own Python under qemu-user.
 """
 
 import json
@@ -33,18 +34,21 @@ WANTS = "etc/systemd/system/multi-user.target.wants"
 UNIT = "kontronik-can-gw.service"
 BOOT_LIMIT_S = 600
 EMULATORS = {
-    "arm64": ("qemu-aarch64", "-cpu", "cortex-a53"),  # the default one's signed pointers are slow
+    "arm64": ("qemu-aarch64", "-cpu", "cortex-a53"),  # signed pointers of the default are slow
     "armhf": ("qemu-arm",),
 }
 OF_APT = re.compile(
     r"(var/(cache|log|lib/(apt|dpkg))|proc|sys|dev|run|tmp)/|root/.*\.deb$|etc/.*-$"
 )
-"""Files that say that something was installed, and are not the package's to remove."""
+"""Files that any installation changes, and that the package need not remove."""
 IN_A_NAMESPACE = """
 ip link set lo up
-mount -t proc proc "$0/proc"; mount -t sysfs sys "$0/sys"; mount -t devpts -o newinstance,ptmxmode=666 devpts "$0/dev/pts"
+mount -t proc proc "$0/proc"
+mount -t sysfs sys "$0/sys"
+mount -t devpts -o newinstance,ptmxmode=666 devpts "$0/dev/pts"
 mount -t tmpfs run "$0/run"
-exec chroot "$0" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8 DEBIAN_FRONTEND=noninteractive "$@"
+exec chroot "$0" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8 \\
+    DEBIAN_FRONTEND=noninteractive "$@"
 """
 
 if os.geteuid():
@@ -53,12 +57,12 @@ if os.geteuid():
 
 @dataclass(frozen=True)
 class Root:
-    """A folder with a Debian in it."""
+    """A folder with a Debian system."""
 
     path: Path
 
     def run(self, *words: str, code: int | None = 0) -> str:
-        """What a command in it prints; without a network, in /root."""
+        """Run a command in the folder /root of the root, without a network. Return its output."""
         spaces = ("unshare", "--net", "--mount", "--pid", "--fork", "--kill-child")
         command = [*spaces, "sh", "-c", IN_A_NAMESPACE, str(self.path), "sh", "-c"]
         done = subprocess.run(
@@ -82,7 +86,7 @@ class Root:
         return self.run("apt-get", "install", "-y", f"/root/{package.name}")
 
     def files(self) -> dict[str, str]:
-        """Every file but those of apt, with the content of what lists users."""
+        """Return every file except apt's. Files that list users have their content."""
         found = {}
         for path in self.path.rglob("*"):
             name = str(path.relative_to(self.path))
@@ -97,7 +101,7 @@ class Root:
 
 @pytest.fixture(scope="module")
 def work() -> Iterator[Path]:
-    """A folder that a virtual machine sees, unlike /tmp."""
+    """Yield a folder that is visible in a virtual machine, unlike /tmp."""
     CACHE.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="work.", dir=CACHE) as folder:
         Path(folder).chmod(0o755)
@@ -106,7 +110,7 @@ def work() -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def packages(work: Path) -> dict[str, Path]:
-    """By architecture, made twice."""
+    """Build the packages twice and check that they are equal. Return them by architecture."""
     for name in ("packages", "again"):
         assert make_deb.main(work / name) == 0
     made = sorted((work / "packages").iterdir())
@@ -118,7 +122,7 @@ def packages(work: Path) -> dict[str, Path]:
 
 @pytest.fixture
 def root(request: pytest.FixtureRequest, work: Path) -> Iterator[Root]:
-    """A fresh root of a release, with Python and systemd."""
+    """Yield a fresh root of a release, with Python and systemd."""
     release = request.param
     kept = CACHE / f"{release}.tar"
     if not kept.exists():
@@ -137,17 +141,22 @@ def root(request: pytest.FixtureRequest, work: Path) -> Iterator[Root]:
 both_releases = pytest.mark.parametrize("root", RELEASES, indirect=True)
 
 
-def purge(root: Root, before: dict[str, str], *left: str) -> None:
+def purge(
+    root: Root,
+    before: dict[str, str],
+    *left: str,
+) -> None:
     root.run("apt-get", "purge", "-y", "kontronik-can-gw")
     after = root.files()
     assert {name: after.get(name) for name in before} == before
     assert sorted(set(after) - set(before)) == sorted(left)
 
 
-def test_lintian_has_nothing_to_say(packages: dict[str, Path]) -> None:
+def test_lintian_finds_no_fault(packages: dict[str, Path]) -> None:
     command = ["lintian", "--allow-root", *map(str, packages.values())]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stdout == ""
+    assert done.returncode == 0
 
 
 @both_releases
@@ -165,16 +174,26 @@ def test_every_command_works_in_a_fresh_root(packages: dict[str, Path], root: Ro
     for command in commands:
         assert f"usage: kontronik-can-gw {command}" in root.gateway(command, "--help")
     for line in (
-        *("init gateway.toml", "schema", "describe", "completion bash", "dbc --esc 2", "eds"),
-        *("check -c gateway.toml", "export c firmware", "monitor flight.kcap --once"),
-        *("report flight.kcap -o t.html", "demo --seconds 1", "convert flight.kcap - --to candump"),
+        "init gateway.toml",
+        "schema",
+        "describe",
+        "completion bash",
+        "dbc --esc 2",
+        "eds",
+        "check -c gateway.toml",
+        "export c firmware",
+        "monitor flight.kcap --once",
+        "report flight.kcap -o t.html",
+        "demo --seconds 1",
+        "convert flight.kcap - --to candump",
         *(f"convert flight.kcap t.{form}" for form in ["csv", "jsonl", "log", "asc", "blf", "trc"]),
     ):
         root.gateway(*line.split())
     for line, library in (("t.parquet", "pyarrow"), ("t.mf4 --to mf4-log", "asammdf")):
         said = root.gateway("convert", "flight.kcap", *line.split(), code=1)
         assert said.count("\n") == 1
-        assert f"needs {library}" in said and "The Debian package leaves it out." in said
+        assert f"needs {library}" in said
+        assert "The Debian package leaves it out." in said
     assert "core: C" in root.gateway("doctor", "-c", "gateway.toml", code=1)
     assert root.gateway("status", code=3).count("\n") == 1
     assert "needs" not in root.run("timeout", "5", "kontronik-can-gw", "metrics", code=124)
@@ -187,8 +206,9 @@ def test_every_command_works_in_a_fresh_root(packages: dict[str, Path], root: Ro
 
 
 @both_releases
-def test_it_can_be_installed_and_purged_without_systemd(
-    packages: dict[str, Path], root: Root
+def test_the_package_can_be_installed_and_purged_without_systemd(
+    packages: dict[str, Path],
+    root: Root,
 ) -> None:
     root.run("apt-get", "purge", "-y", "systemd")
     before = root.files()
@@ -199,7 +219,10 @@ def test_it_can_be_installed_and_purged_without_systemd(
 
 
 def install_0_5_0(root: Root, work: Path) -> str:
-    """What its `service install` wrote, with every key that was removed since; the configuration."""
+    """Write the files of `service install` of 0.5.0. Return the configuration.
+
+    The configuration has every key that was removed after 0.5.0.
+    """
     sources = work / "0.5.0"
     sources.mkdir(exist_ok=True)
     archive = ["git", "-C", str(PROJECT), "archive", VERSION_0_5_0]
@@ -225,8 +248,16 @@ def install_0_5_0(root: Root, work: Path) -> str:
     return text
 
 
-def booted(root: Root, out: Path, script: str, *how: str) -> dict[str, Any]:
-    """What a script saw after a boot of the root in a virtual machine; ``ro``: read-only, with /var in memory."""
+def booted(
+    root: Root,
+    out: Path,
+    script: str,
+    *how: str,
+) -> dict[str, Any]:
+    """Boot the root in a virtual machine and run a script. Return the facts that it found.
+
+    With ``ro`` the root is read-only, and /var is in memory.
+    """
     out.mkdir(exist_ok=True)
     for name in ("on_board.py", "on_upgrade.py"):
         shutil.copy(HERE / name, out)
@@ -234,17 +265,23 @@ def booted(root: Root, out: Path, script: str, *how: str) -> dict[str, Any]:
     command += [f"--timeout={BOOT_LIMIT_S}", f"--rw={root.path.parent}", "--"]
     command += ["sh", f"{HERE}/boot_root.sh", str(root.path), str(out), script, *how]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    facts, said = out / "facts.json", out / "said"
-    assert facts.exists(), done.stdout + done.stderr + (said.read_text() if said.exists() else "")
+    facts = out / "facts.json"
+    said = out / "said"
+    talk = done.stdout + done.stderr
+    if said.exists():
+        talk += said.read_text()
+    assert facts.exists(), talk
     found: dict[str, Any] = json.loads(facts.read_text())
     return found
 
 
 @both_releases
-def test_it_takes_over_from_0_5_0_runs_read_only_and_leaves_nothing(
-    packages: dict[str, Path], root: Root, work: Path
+def test_the_package_replaces_0_5_0_runs_read_only_and_is_purged(
+    packages: dict[str, Path],
+    root: Root,
+    work: Path,
 ) -> None:
-    for name in ("sysusers.d", "udev/rules.d"):  # systemd's, which this root lacks
+    for name in ("sysusers.d", "udev/rules.d"):  # folders of systemd that this root lacks
         (root.path / "etc" / name).mkdir(parents=True, exist_ok=True)
     before = root.files()
     configuration = install_0_5_0(root, work)
@@ -282,8 +319,10 @@ def test_it_takes_over_from_0_5_0_runs_read_only_and_leaves_nothing(
 
 
 @both_releases
-def test_a_running_gateway_goes_on_after_an_upgrade_and_ends_with_the_package(
-    packages: dict[str, Path], root: Root, work: Path
+def test_a_running_gateway_is_restarted_by_an_upgrade_and_ended_by_removal(
+    packages: dict[str, Path],
+    root: Root,
+    work: Path,
 ) -> None:
     root.install(packages["amd64"])
     text = root.text(CONFIGURATION).replace('"can0"', '"vcan0"')
@@ -294,18 +333,20 @@ def test_a_running_gateway_goes_on_after_an_upgrade_and_ends_with_the_package(
     facts = booted(root, out, "on_upgrade.py")
     assert facts["fresh"], facts["install said"]
     assert facts["fresh after upgrade"], facts["upgrade said"]
-    before, after = facts["installed"], facts["upgraded"]
+    before = facts["installed"]
+    after = facts["upgraded"]
     assert before["FragmentPath"] == f"/etc/systemd/system/{UNIT}"
     assert after["FragmentPath"].endswith(f"/lib/systemd/system/{UNIT}")
     assert after["FragmentPath"] != before["FragmentPath"]
-    assert (before["MainPID"] != after["MainPID"], after["NRestarts"]) == (True, "0")
+    assert before["MainPID"] != after["MainPID"]
+    assert after["NRestarts"] == "0"
     assert facts["removed"]["ActiveState"] == "inactive", facts["removal said"]
     assert facts["removed"]["LoadState"] == "not-found"
     assert facts["left"] == "", facts["purge said"]
 
 
 def newer(package: Path, folder: Path) -> Path:
-    """The same as version 99 with other units, as newer.deb of a folder."""
+    """Write a copy of the package as version 99 with changed units. Return its path."""
     folder.mkdir(exist_ok=True)
     made = folder / "newer.deb"
     with tempfile.TemporaryDirectory(dir=folder) as tree:
@@ -320,12 +361,19 @@ def newer(package: Path, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("architecture", "release"), list(zip(EMULATORS, reversed(RELEASES), strict=True))
+    ("architecture", "release"),
+    list(zip(EMULATORS, reversed(RELEASES), strict=True)),
 )
-def test_the_core_of_an_arm_package_runs_in_the_python_of_the_release(
-    packages: dict[str, Path], work: Path, architecture: str, release: str
+def test_the_core_of_an_arm_package_runs_in_the_releases_python(
+    packages: dict[str, Path],
+    work: Path,
+    architecture: str,
+    release: str,
 ) -> None:
-    """A capture becomes the same table as on this machine: an architecture in each release."""
+    """It converts a capture to the same table as on this machine.
+
+    Each release is tested with one architecture.
+    """
     kept = CACHE / f"{release}.{architecture}"
     options = (f"--arch={architecture}", "--variant=minbase", "--include=python3")
     archives = "var/cache/apt/archives"
@@ -339,7 +387,8 @@ def test_the_core_of_an_arm_package_runs_in_the_python_of_the_release(
             subprocess.run(["dpkg-deb", "-x", package, folder], check=True)
         script = (
             f"import sys; sys.path.insert(0, '{folder}/usr/lib/kontronik-can-gw')\n"
-            "from kontronik_can_gw.cli import main; from kontronik_can_gw.native.load import library\n"
+            "from kontronik_can_gw.cli import main\n"
+            "from kontronik_can_gw.native.load import library\n"
             f"assert library()[0] is not None, library()[1]\nsys.exit(main(sys.argv[1:]))"
         )
         words = ["convert", str(CAPTURE)]

@@ -1,4 +1,7 @@
-"""Run by systemd in a booted Debian root (boot_root.sh) by its own Python: what the installed gateway does, to /media/facts.json."""
+"""systemd runs this script in a booted Debian root (boot_root.sh), with the root's own Python.
+
+It writes facts about the installed gateway to /media/facts.json.
+"""
 
 import contextlib
 import json
@@ -9,17 +12,26 @@ import time
 from pathlib import Path
 
 VALUES = 0x698
-"""The shipped DBC's EscShaft."""
+"""Id of EscShaft in the shipped DBC."""
 LIMIT_S = 120.0
 
 
 def run(*words: str) -> str:
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LIMIT_S)
+    done = subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LIMIT_S,
+    )
     return done.stdout + done.stderr
 
 
 def fresh() -> bool:
-    """True if a value of the ESC comes on the bus: until then the bytes of that message say "not available"."""
+    """Return whether a value of the ESC appears on the bus.
+
+    Before that the bytes of its message mean "not available".
+    """
     start = time.monotonic()
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:
         bus.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", VALUES, 0x7FF))

@@ -1,4 +1,8 @@
-"""Run by systemd in a booted Debian root (boot_root.sh): an upgrade, removal and purge while the gateway runs, to /media/facts.json."""
+"""systemd runs this script in a booted Debian root (boot_root.sh).
+
+It upgrades, removes and purges the package while the gateway runs, and writes the facts to
+/media/facts.json.
+"""
 
 import json
 from pathlib import Path
@@ -10,7 +14,8 @@ UNIT = "kontronik-can-gw.service"
 
 def unit() -> dict[str, str]:
     names = "MainPID,ActiveState,LoadState,NRestarts,FragmentPath"
-    return dict(line.split("=", 1) for line in run("systemctl", "show", "-p", names, UNIT).split())
+    lines = run("systemctl", "show", "-p", names, UNIT).split()
+    return dict(line.split("=", 1) for line in lines)
 
 
 def main() -> None:

@@ -1,7 +1,8 @@
-"""What is in the Debian packages, made here without a network: from these sources, with stand-ins for the libraries and the core's objects.
+"""The content of the Debian packages, built without a network.
 
-That they can be installed, upgraded and removed, and that the gateway runs from them, is tried in fresh Debian roots by `make release`
-(in_fresh_roots.py).
+They are built from these sources, with replacements for the libraries and the core's objects.
+`make release` installs, upgrades and removes the packages in fresh Debian roots, and runs the
+gateway from them (in_fresh_roots.py).
 """
 
 import gzip
@@ -27,13 +28,13 @@ from kontronik_can_gw.cli.service import PLAIN, planned
 
 PROJECT = make_deb.PROJECT
 LEFT_OUT = {"wrapt", "markdown-it-py", "pygments", "argparse-addons", "crccheck"}
-"""What a library names and no command of ours imports."""
-VENDORED = {
-    canonicalize_name(pin.name): pin
+"""Dependencies of libraries that no command of ours imports."""
+PINS = [
+    Requirement(line.split(" --hash")[0])
     for line in (make_deb.HERE / "vendored.txt").read_text().splitlines()
     if not line.startswith("#")
-    for pin in [Requirement(line.split(" --hash")[0])]
-}
+]
+VENDORED = {canonicalize_name(pin.name): pin for pin in PINS}
 OWN = f"./usr/lib/{make_deb.NAME}/kontronik_can_gw/"
 
 if shutil.which("dpkg-deb") is None:
@@ -49,30 +50,29 @@ def zipped(path: Path, files: dict[str, bytes]) -> Path:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The packages by architecture."""
+    """Build the packages. Return their contents by architecture."""
     folder = tmp_path_factory.mktemp("deb")
-    sources = [path for path in (PROJECT / "kontronik_can_gw").rglob("*") if path.is_file()]
-    files = {
-        str(path.relative_to(PROJECT)): path.read_bytes()
-        for path in sources
-        if path.suffix in (".py", ".toml", ".service")
-    }
+    files = {}
+    for path in (PROJECT / "kontronik_can_gw").rglob("*"):
+        if path.is_file() and path.suffix in (".py", ".toml", ".service"):
+            files[str(path.relative_to(PROJECT))] = path.read_bytes()
     for machine in make_deb.MACHINES.values():
         files[f"kontronik_can_gw/native/core-{machine}.so"] = machine.encode()
     wheel = zipped(folder / "gateway.whl", files)
     library = {"bitstruct/__init__.py": b"", "bitstruct/c.so": b"", "bitstruct.data/scripts/x": b""}
     libraries = [zipped(folder / "bitstruct.whl", library)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(
-            "SOURCE_DATE_EPOCH", "1700000000"
-        )  # the sources may be no clone of a repository
+        # The sources may be without a repository.
+        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
         packages = make_deb.make(wheel, libraries, folder)
     return {path.stem.rpartition("_")[2]: path.read_bytes() for path in packages}
 
 
 @pytest.mark.parametrize("is_git_installed", [True, False])
-def test_without_a_repository_the_remedy_is_one_line(
-    is_git_installed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_without_a_repository_the_remedy_is_given_in_one_line(
+    is_git_installed: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("SOURCE_DATE_EPOCH", raising=False)
     monkeypatch.setattr(make_deb, "PROJECT", tmp_path)
@@ -88,7 +88,10 @@ def contents(package: bytes, part: str = "--fsys-tarfile") -> dict[str, tarfile.
 
 def opened(package: bytes, part: str = "--fsys-tarfile") -> tarfile.TarFile:
     done = subprocess.run(
-        ["dpkg-deb", part, "/dev/stdin"], input=package, capture_output=True, check=True
+        ["dpkg-deb", part, "/dev/stdin"],
+        input=package,
+        capture_output=True,
+        check=True,
     )
     return tarfile.open(fileobj=io.BytesIO(done.stdout))
 
@@ -97,10 +100,12 @@ def text(package: bytes, name: str, part: str = "--fsys-tarfile") -> str:
     file = opened(package, part).extractfile(name)
     assert file is not None
     content = file.read()
-    return (gzip.decompress(content) if name.endswith(".gz") else content).decode()
+    if name.endswith(".gz"):
+        content = gzip.decompress(content)
+    return content.decode()
 
 
-def test_each_architecture_has_its_object_alone_and_depends_on_python_alone(
+def test_each_package_has_only_its_object_and_depends_only_on_python(
     made: dict[str, bytes],
 ) -> None:
     assert set(made) == {"amd64", "arm64", "armhf"}
@@ -108,36 +113,34 @@ def test_each_architecture_has_its_object_alone_and_depends_on_python_alone(
         objects = [name for name in contents(package) if name.endswith(".so")]
         assert objects == [f"{OWN}native/core-{make_deb.MACHINES[architecture]}.so"]
         assert text(package, objects[0]) == make_deb.MACHINES[architecture]
-        control = dict(
-            re.findall(r"^(\S+): (.*)$", text(package, "./control", "--ctrl-tarfile"), re.MULTILINE)
-        )
-        assert (control["Architecture"], control["Depends"]) == (architecture, "python3 (>= 3.11)")
+        lines = text(package, "./control", "--ctrl-tarfile")
+        control = dict(re.findall(r"^(\S+): (.*)$", lines, re.MULTILINE))
+        assert control["Architecture"] == architecture
+        assert control["Depends"] == "python3 (>= 3.11)"
         assert control["Version"] == make_deb.version()
 
 
-def test_nothing_is_in_etc_or_var_and_all_is_roots(made: dict[str, bytes]) -> None:
+def test_no_file_is_in_etc_or_var_and_all_files_belong_to_root(made: dict[str, bytes]) -> None:
     found = contents(made["amd64"])
     assert [name for name in found if name.startswith(("./etc", "./var", "./run"))] == []
+    programs = ("/bin/kontronik-can-gw", "take-over", "make-user", "rtupdate")
     for name, member in found.items():
-        executable = member.isdir() or name.endswith(
-            ("/bin/kontronik-can-gw", "take-over", "make-user", "rtupdate")
-        )
+        is_executable = member.isdir() or name.endswith(programs)
+        mode = 0o755 if is_executable else 0o644
         assert (member.uid, member.gid, member.uname) == (0, 0, "root"), name
-        assert member.mode & 0o777 == (0o755 if executable else 0o644), name
+        assert member.mode & 0o777 == mode, name
 
 
-def test_units_rules_completion_and_manual_are_in_place(made: dict[str, bytes]) -> None:
+def test_the_package_has_units_rules_completion_and_manual(made: dict[str, bytes]) -> None:
     package = made["armhf"]
     found = contents(package)
     for kind in ("", "-mqtt", "-metrics"):
         for instance in ("", "@"):
-            unit = text(
-                package, f"./usr/lib/systemd/system/kontronik-can-gw{kind}{instance}.service"
-            )
+            name = f"kontronik-can-gw{kind}{instance}.service"
+            unit = text(package, f"./usr/lib/systemd/system/{name}")
             assert unit.startswith("[Unit]\n")
-            assert re.search(
-                "^ExecStart=/usr/bin/kontronik-can-gw (run|mqtt|metrics) ", unit, re.MULTILINE
-            )
+            start = "^ExecStart=/usr/bin/kontronik-can-gw (run|mqtt|metrics) "
+            assert re.search(start, unit, re.MULTILINE)
             assert re.search("@[A-Z]+@", unit) is None
     for name in (
         "lib/sysusers.d/kontronik-can-gw.conf",
@@ -157,14 +160,16 @@ def test_dpkg_can_verify_every_file(made: dict[str, bytes]) -> None:
     package = made["arm64"]
     sums = text(package, "./md5sums", "--ctrl-tarfile").splitlines()
     listed = [line.split("  ", 1)[1] for line in sums]
-    assert sorted(listed) == sorted(
-        name[2:] for name, member in contents(package).items() if member.isfile()
-    )
+    files = [name[2:] for name, member in contents(package).items() if member.isfile()]
+    assert sorted(listed) == sorted(files)
 
 
 @pytest.fixture
 def board(tmp_path: Path) -> Path:
-    """A root with the package's files of the service, the scripts moved into it, and stand-ins for the tools they call."""
+    """Return a root with the package's files of the service and its scripts.
+
+    The tools that the scripts call are replaced.
+    """
     make_deb.put_service(tmp_path)
     for name in ("take-over", *make_deb.SCRIPTS):
         script = (make_deb.HERE / name).read_text()
@@ -177,44 +182,52 @@ def board(tmp_path: Path) -> Path:
 
 
 def script(board: Path, name: str, *words: str) -> str:
-    """What a script of the package prints in the root."""
+    """Run a script of the package in the root. Return its output."""
     path = board / "usr/lib/kontronik-can-gw" / name
     environment = os.environ | {"PATH": f"{board}/bin:{os.environ['PATH']}"}
     done = subprocess.run(
-        [path, *words], env=environment, capture_output=True, text=True, check=False
+        [path, *words],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stderr == ""
+    assert done.returncode == 0
     return done.stdout
 
 
 def installed(board: Path) -> list[Path]:
-    """What `service install` of a program in /opt writes."""
+    """Write the files of `service install` for a program in /opt. Return the paths."""
     files = planned("/opt/x/bin/kontronik-can-gw")
     for place, content in files:
         make_deb.put(board / place, content)
     return sorted(path for path in (board / "etc").rglob("*") if path.is_file())
 
 
-@pytest.mark.parametrize("words", [("take-over",), ("prerm", "upgrade", "99"), ("prerm", "remove")])
-def test_the_package_takes_over_what_service_install_wrote(
-    board: Path, words: tuple[str, ...]
-) -> None:
-    """And before another version's files take the place of those to compare with."""
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("take-over",),
+        ("prerm", "upgrade", "99"),
+        ("prerm", "remove"),
+    ],
+)
+def test_the_package_removes_files_of_service_install(board: Path, words: tuple[str, ...]) -> None:
+    """It also does so before another version's files replace the files to compare with."""
     installed(board)
     link = board / "etc/systemd/system/multi-user.target.wants/kontronik-can-gw@left.service"
     link.parent.mkdir()
     link.symlink_to(board / "etc/systemd/system/kontronik-can-gw@.service")
     assert "changed by hand" not in script(board, *words)
     left = {str(path.relative_to(board / "etc")) for path in (board / "etc").rglob("*")}
-    folders = ["sysusers.d", "systemd", "systemd/system", "tmpfiles.d", "udev", "udev/rules.d"]
-    assert left == {
-        *folders,
-        *(str(path.relative_to(board / "etc")) for path in (link.parent, link)),
-    }
+    expected = {"sysusers.d", "systemd", "systemd/system", "tmpfiles.d", "udev", "udev/rules.d"}
+    expected |= {str(path.relative_to(board / "etc")) for path in (link.parent, link)}
+    assert left == expected
     assert link.readlink() == board / "usr/lib/systemd/system/kontronik-can-gw@.service"
 
 
-def test_what_was_changed_by_hand_stays_and_is_named(board: Path) -> None:
+def test_files_changed_by_hand_are_kept_and_reported(board: Path) -> None:
     files = installed(board)
     for path in files:
         path.write_text(path.read_text() + "# mine\n")
@@ -224,26 +237,28 @@ def test_what_was_changed_by_hand_stays_and_is_named(board: Path) -> None:
     assert all(path.exists() for path in files)
 
 
-def test_a_purge_leaves_network_files_and_what_another_installation_needs(board: Path) -> None:
+def test_a_purge_keeps_network_files_and_another_installations_files(board: Path) -> None:
     kept = [board / "etc/kontronik-can-gw/gateway.toml", board / "var/lib/kontronik-can-gw/esc1"]
     network = board / "etc/systemd/network/50-kontronik-can-gw-can0.network"
     for path in (*kept, network):
         make_deb.put(path, "x")
     installed(board)
     said = script(board, "postrm", "purge")
-    assert ".service: is not part of the package. Configurations" in said and "userdel" not in said
+    assert ".service: is not part of the package. Configurations" in said
+    assert "userdel" not in said
     assert all(path.exists() for path in kept)
     script(board, "take-over")
     assert "userdel kontronik-can-gw" in script(board, "postrm", "purge")
-    left = [path.name for name in ("etc", "var") for path in (board / name).rglob("*kontronik*")]
-    assert left == [network.name]
+    left = [*(board / "etc").rglob("*kontronik*"), *(board / "var").rglob("*kontronik*")]
+    assert [path.name for path in left] == [network.name]
 
 
 @pytest.mark.parametrize("is_there", [False, True])
 def test_without_systemd_the_user_is_the_one_that_sysusers_would_create(
-    is_there: bool, tmp_path: Path
+    is_there: bool,
+    tmp_path: Path,
 ) -> None:
-    """Only stand-ins are on the path, so systemd-sysusers is missing."""
+    """Only replacements are in PATH, so systemd-sysusers is missing."""
     for name in ("useradd", "groupadd"):
         make_deb.put(tmp_path / name, f'#!/bin/sh\necho {name} "$@"\n', 0o755)
     make_deb.put(tmp_path / "getent", f"#!/bin/sh\nexit {0 if is_there else 2}\n", 0o755)
@@ -259,17 +274,14 @@ def test_without_systemd_the_user_is_the_one_that_sysusers_would_create(
         return
     made = done.stdout.splitlines()
     assert made[:2] == ["groupadd --system dialout", "groupadd --system uucp"]
-    rows = [
-        shlex.split(line)
-        for line in (PLAIN / "sysusers.conf").read_text().splitlines()
-        if not line.startswith("#")
-    ]
+    lines = (PLAIN / "sysusers.conf").read_text().splitlines()
+    rows = [shlex.split(line) for line in lines if not line.startswith("#")]
     groups = [row[2] for row in rows if row[0] == "m"]
     ((_, user, _, comment, home, shell),) = [row for row in rows if row[0] == "u"]
     assert shell == "-"  # means nologin for a system user
     assert made[2] == (
-        f"useradd --system --user-group --groups {','.join(groups)} --no-create-home --home-dir {home} "
-        f"--shell /usr/sbin/nologin --comment {comment} {user}"
+        f"useradd --system --user-group --groups {','.join(groups)} --no-create-home "
+        f"--home-dir {home} --shell /usr/sbin/nologin --comment {comment} {user}"
     )
 
 
@@ -313,10 +325,17 @@ def test_no_command_imports_a_library_that_is_left_out() -> None:
         "        importlib.import_module(module.name)\n"
         "from kontronik_can_gw.cli import main\n"
         "assert main(['demo', '--seconds', '0.1']) == 0\n"
-        "import can.interfaces.socketcan, can.interfaces.slcan, can.interfaces.pcan, canopen, cantools.database\n"
+        "import can.interfaces.socketcan, can.interfaces.slcan, can.interfaces.pcan\n"
+        "import canopen, cantools.database\n"
     )
     modules = ["wrapt", "markdown_it", "pygments", "argparse_addons", "crccheck", "diskcache"]
     modules += ["msgpack", "bitstruct.c", "numpy", "pyarrow", "asammdf"]
     command = [sys.executable, "-c", script, *modules]
-    done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command,
+        cwd=PROJECT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr

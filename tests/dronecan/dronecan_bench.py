@@ -1,4 +1,7 @@
-"""A gateway with DroneCAN nodes, without a clock; the package ``dronecan`` reads what it sends, and asks."""
+"""A gateway with DroneCAN nodes and without a clock.
+
+The package ``dronecan`` reads its frames and sends requests.
+"""
 
 from dataclasses import dataclass
 from importlib import import_module
@@ -14,7 +17,7 @@ from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.times import MS, SECOND
 
 dronecan: Any = import_module("dronecan")
-"""The package; for mypy this folder has its name."""
+"""The package. mypy would take this folder for it, which has the same name."""
 transport = dronecan.transport
 START = 777 * SECOND + 5
 LIVE = LiveData(
@@ -31,35 +34,40 @@ LIVE = LiveData(
 )
 
 
-def loaded(escs: int = 1, dbc: bool = False, canopen: bool = False, **table: Any) -> Loaded:
-    """A configuration with these keys of [dronecan]."""
-    return assemble(
-        parse(
-            {
-                "can": {"interface": "virtual", "bitrate": 1_000_000},
-                "dbc": {"enabled": dbc},
-                "canopen": {"enabled": canopen, "self_start": True, "store": "/nonexistent/store"},
-                "dronecan": {"enabled": True, "node_id": 42} | table,
-                "esc": [
-                    {"port": f"/dev/ttyUSB{n}", "name": f"e{n}", "pole_pairs": 7, "gear": "10"}
-                    for n in range(escs)
-                ],
-            },
-            "bench.toml",
-        )
-    )
+def loaded(
+    escs: int = 1,
+    dbc: bool = False,
+    canopen: bool = False,
+    **table: Any,
+) -> Loaded:
+    """Return a loaded configuration with these keys of [dronecan]."""
+    tables: dict[str, Any] = {
+        "can": {"interface": "virtual", "bitrate": 1_000_000},
+        "dbc": {"enabled": dbc},
+        "canopen": {"enabled": canopen, "self_start": True, "store": "/nonexistent/store"},
+        "dronecan": {"enabled": True, "node_id": 42} | table,
+        "esc": [],
+    }
+    for number in range(escs):
+        port = f"/dev/ttyUSB{number}"
+        esc = {"port": port, "name": f"e{number}", "pole_pairs": 7, "gear": "10"}
+        tables["esc"].append(esc)
+    return assemble(parse(tables, "bench.toml"))
 
 
 @dataclass(frozen=True)
 class Transfer:
-    """A transfer as the package ``dronecan`` reads it. ``payload``: a message, a request or a response."""
+    """A transfer that the package ``dronecan`` has read.
+
+    Its payload is a message, a request or a response.
+    """
 
     at: int
     source: int
     payload: Any
     to: int | None
     number: int
-    """Its transfer id."""
+    """The transfer id."""
 
     @property
     def name(self) -> str:
@@ -67,21 +75,24 @@ class Transfer:
 
 
 class Reader:
-    """What the package makes of frames."""
+    """Reads frames with the package."""
 
     def __init__(self) -> None:
         self._begun: dict[int, list[Any]] = {}
         self._numbers: dict[int, int] = {}
 
     def read(self, at: int, frame: CanFrame) -> Transfer | None:
-        """The transfer that this frame completes; AssertionError where it is invalid."""
+        """Return the transfer that this frame completes, or None.
+
+        Raise AssertionError if the transfer is invalid.
+        """
         assert frame.extended
         assert not frame.fd
         frames = self._begun.setdefault(frame.can_id, [])
         if frame.data[-1] & 0x80:
             frames.clear()
             number = frame.data[-1] & 0x1F
-            # of a node's message: with the same one it would be taken for one that comes twice
+            # A message of a node with the previous transfer id would be taken for a repetition.
             if frame.can_id & 0x7F and not frame.can_id & 0x80:
                 assert number != self._numbers.get(frame.can_id)
             self._numbers[frame.can_id] = number
@@ -90,14 +101,27 @@ class Reader:
             return None
         found = transport.Transfer()
         found.from_frames(self._begun.pop(frame.can_id))  # checks order, toggle and CRC
-        of = found.source_node_id, found.payload, found.dest_node_id, found.transfer_id
-        return Transfer(at, *of)
+        return Transfer(
+            at,
+            found.source_node_id,
+            found.payload,
+            found.dest_node_id,
+            found.transfer_id,
+        )
 
 
 class Bench:
-    """``escs``: number; what they send is ``live`` (None: nothing) every 10 ms."""
+    """A gateway with this number of ESCs.
 
-    def __init__(self, escs: int = 1, given: Loaded | None = None, **table: Any) -> None:
+    Every 10 ms each ESC sends its frame of ``live``, unless that is None.
+    """
+
+    def __init__(
+        self,
+        escs: int = 1,
+        given: Loaded | None = None,
+        **table: Any,
+    ) -> None:
         self.loaded = given or loaded(escs, **table)
         self.now = START
         self.gateway = Gateway(
@@ -118,29 +142,34 @@ class Bench:
 
     @property
     def nodes(self) -> list[Any]:
-        """What is reported of each node."""
+        """The reported facts of each node."""
         found: list[Any] = self.output.facts()["nodes"]
         return found
 
     def hear(self, data: LiveData | InfoData, esc: int = 0) -> None:
-        """A frame of an ESC."""
+        """Receive a frame of an ESC."""
         self.gateway.receive_bytes(esc, encode(data, Layout.V4), self.now, self.now)
 
     def take(self) -> None:
         for frame in self.gateway.take_frames(self.now):
             self.frames.append((self.now, frame))
-            if frame.extended and (found := self._reader.read(self.now, frame)) is not None:
-                self.read.append(found)
+            if frame.extended:
+                found = self._reader.read(self.now, frame)
+                if found is not None:
+                    self.read.append(found)
 
     def run(self, seconds: float) -> "Bench":
         """Let time pass."""
         end = self.now + round(seconds * SECOND)
         while self.now < end:
-            following = min(end, START + ((self.now - START) // (10 * MS) + 1) * 10 * MS)
-            while (due := self.gateway.next_deadline()) < following:
+            periods = (self.now - START) // (10 * MS) + 1
+            following = min(end, START + periods * 10 * MS)
+            due = self.gateway.next_deadline()
+            while due < following:
                 self.now = max(self.now, due)
                 self.gateway.advance(self.now)
                 self.take()
+                due = self.gateway.next_deadline()
             self.now = following
             for esc, live in enumerate(self.live):
                 if live is not None and following % (10 * MS) == START % (10 * MS):
@@ -150,7 +179,7 @@ class Bench:
         return self
 
     def receive(self, *frames: CanFrame) -> None:
-        """Frames of others, if our filters let them through."""
+        """Receive frames of other nodes that pass our filters."""
         for frame in frames:
             ids = self.gateway.receive_ids
             if frame.key in ids or block_of(frame.key, ids) is not None:
@@ -159,7 +188,7 @@ class Bench:
         self.take()
 
     def ask(self, request: Any, to: int = 42) -> Any:
-        """The answer to a foreign node's request; None for none."""
+        """Return the answer to a foreign node's request, or None without an answer."""
         self.receive(*peers_frames(request, 100, to, transfer_id=7))
         answers = [each for each in self.read if each.to == 100]
         self.read = [each for each in self.read if each.to != 100]
@@ -167,11 +196,11 @@ class Bench:
         return answers[-1].payload if answers else None
 
     def of(self, name: str, source: int | None = None) -> list[Transfer]:
-        """Transfers of a type so far."""
+        """Return all transfers of a type so far."""
         return [each for each in self.read if each.name == name and source in (None, each.source)]
 
     def intervals(self, name: str) -> set[int]:
-        """Between transfers of a type."""
+        """Return the times between transfers of a type."""
         return {after.at - before.at for before, after in pairwise(self.of(name))}
 
     def clear(self) -> None:
@@ -179,8 +208,13 @@ class Bench:
         self.frames.clear()
 
 
-def peers_frames(payload: Any, source: int, to: int | None = None, **more: Any) -> list[CanFrame]:
-    """The frames of a transfer as the package makes them."""
+def peers_frames(
+    payload: Any,
+    source: int,
+    to: int | None = None,
+    **more: Any,
+) -> list[CanFrame]:
+    """Return the frames of a transfer, created by the package."""
     is_service = to is not None
     made = transport.Transfer(
         payload=payload,

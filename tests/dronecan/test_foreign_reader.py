@@ -1,4 +1,7 @@
-"""The crate ``dronecan`` (Rust) puts our transfers together and reads their values. tests/foreign/install.sh builds it."""
+"""The Rust crate ``dronecan`` reads our transfers and their values.
+
+tests/foreign/install.sh builds it.
+"""
 
 import math
 import random
@@ -15,9 +18,10 @@ protocol = dronecan_bench.dronecan.uavcan.protocol
 pytestmark = pytest.mark.extended
 
 
-def test_the_crate_reads_what_the_package_reads() -> None:
+def test_the_crate_reads_the_same_transfers_as_the_package() -> None:
     need(READER.exists(), "dronecan-reader")
-    rng, bench = random.Random(3), Bench(4, extended_hz=10)
+    rng = random.Random(3)
+    bench = Bench(4, extended_hz=10)
     for turn in range(100):
         for esc in range(4):
             bench.live[esc] = LIVE._replace(
@@ -33,7 +37,13 @@ def test_the_crate_reads_what_the_package_reads() -> None:
     for request in (protocol.GetNodeInfo.Request(), *requests):
         assert bench.ask(request) is not None
     lines = "".join(f"{f.can_id:X}#{f.data.hex()}\n" for _, f in bench.frames if f.extended)
-    done = subprocess.run([READER], input=lines, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [READER],
+        input=lines,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     found = [line.split() for line in done.stdout.splitlines()]
     assert not [each for each in found if each[0] == "error"]
     assert len(found) == len(bench.read) + 17
@@ -44,7 +54,9 @@ def test_the_crate_reads_what_the_package_reads() -> None:
     read = [each.payload for each in bench.of("Status")]
     assert len(statuses) == len(read) > 1900
     for (wrong, *floats, speed, share, place), theirs in zip(statuses, read, strict=True):
-        assert (int(wrong), int(speed)) == (theirs.error_count, theirs.rpm)
-        assert (int(share), int(place)) == (theirs.power_rating_pct, theirs.esc_index)
+        assert int(wrong) == theirs.error_count
+        assert int(speed) == theirs.rpm
+        assert int(share) == theirs.power_rating_pct
+        assert int(place) == theirs.esc_index
         assert [*map(float, floats)] == [theirs.voltage, theirs.current, theirs.temperature]
         assert not any(map(math.isnan, map(float, floats)))

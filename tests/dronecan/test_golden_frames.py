@@ -1,4 +1,7 @@
-"""Frames and types byte by byte: golden ones, and random ones as the package ``dronecan`` makes and reads them."""
+"""Frames and types byte by byte.
+
+Some are golden frames, others are random ones that the package ``dronecan`` creates and reads.
+"""
 
 import random
 import struct
@@ -30,13 +33,13 @@ UNIQUE_ID = bytes(range(1, 17))
 
 
 def shown(frames: list[CanFrame]) -> str:
-    """As candump shows them, the id once."""
+    """Return frames in the format of candump, with their id once."""
     (can_id,) = {frame.can_id for frame in frames if frame.extended}
     return f"{can_id:08X}" + " ".join(f"#{frame.data.hex().upper()}" for frame in frames)
 
 
 class Measuring:
-    """A core with one ESC, which sends one message of it: in C where there is one, or in Python."""
+    """A core with one ESC that sends one message of it. The C core is used if it exists."""
 
     def __init__(
         self,
@@ -45,20 +48,35 @@ class Measuring:
         speed: str = "electrical_speed",
         has_direction: bool = True,
     ) -> None:
-        escs, layout = [EscSettings()], Layout("", "", ())
+        escs = [EscSettings()]
+        layout = Layout("", "", ())
         self.core: Any = PythonCore(escs, layout, 0, False)
         if not is_pure:
-            self.core, why = make_core(escs, layout, 0, False, slots=1)
+            self.core, why = make_core(
+                escs,
+                layout,
+                0,
+                False,
+                slots=1,
+            )
             if why:
                 pytest.skip(why)
-        self.kind, self.now = kind, 0
+        self.kind = kind
+        self.now = 0
         self.plan = plans_of(PROTOCOLS[0], speed, has_direction)[kind]
         self.slot = self.core.slot(0)
         self.slot.start(0)
 
-    def sent(self, live: LiveData, index: int, errors: int = 0, turns: int = 1) -> list[CanFrame]:
-        """What goes out of node 42 with priority 16 for the last of so many frames of the ESC."""
-        can_id, bits = message_id(self.kind.number, 42, 16), fill(self.kind, index, errors)
+    def sent(
+        self,
+        live: LiveData,
+        index: int,
+        errors: int = 0,
+        turns: int = 1,
+    ) -> list[CanFrame]:
+        """Return the frames of node 42 with priority 16 for the last of ``turns`` ESC frames."""
+        can_id = message_id(self.kind.number, 42, 16)
+        bits = fill(self.kind, index, errors)
         self.slot.configure(SlotSettings(self.plan, can_id, True, 1, 3, bits, 64), self.now)
         for _ in range(turns):
             self.now += 10_000_000
@@ -67,7 +85,7 @@ class Measuring:
         return frames
 
     def read(self, live: LiveData, index: int, errors: int = 0) -> Any:
-        """The message, as the package reads it."""
+        """Return the message as the package reads it."""
         reader = Reader()
         found = [reader.read(0, frame) for frame in self.sent(live, index, errors)][-1]
         assert found is not None
@@ -78,8 +96,8 @@ pure = pytest.mark.parametrize("is_pure", [True, False])
 
 
 @pure
-def test_golden_messages(is_pure: bool) -> None:
-    """Made by another implementation, of node 42, with transfer id 5."""
+def test_messages_equal_the_golden_frames(is_pure: bool) -> None:
+    """Another implementation created the frames of node 42 with transfer id 5."""
     live = LiveData(6303, 2423, 473, power_stage_temperature=30, output_opening=42)
     assert shown(Measuring(wire.STATUS, is_pure).sent(live, 3, 7, turns=6)) == (
         "10040A2A#A1F1070000000F85 #4EEA51BD5C9F1825 #150C45"
@@ -92,14 +110,14 @@ def test_golden_messages(is_pure: bool) -> None:
     assert shown(frames) == "1801552A#6400000000EFBEC5"
 
 
-def test_a_golden_answer() -> None:
+def test_an_answer_equals_the_golden_frames() -> None:
     state = wire.NODE_STATUS.pack(100, wire.OK << 6 | wire.OPERATIONAL << 3, 0xBEEF)
     info = wire.GET_NODE_INFO.pack(state, 1, 2, 0, 0, 0, 3, 4, UNIQUE_ID, 0) + b"org.example.esc"
     request = 0x10018000 | 42 << 8 | 0x80 | 10
     answer = transfer(response_id(request), wire.GET_NODE_INFO.seed, info, 5)
     assert shown(answer) == (
-        "10010AAA#6A76640000000085 #EFBE010200000025 #0000000000000005 #0000000304010225 #0304050607080905"
-        " #0A0B0C0D0E0F1025 #006F72672E657805 #616D706C652E6525 #736345"
+        "10010AAA#6A76640000000085 #EFBE010200000025 #0000000000000005 #0000000304010225"
+        " #0304050607080905 #0A0B0C0D0E0F1025 #006F72672E657805 #616D706C652E6525 #736345"
     )
 
 
@@ -108,19 +126,26 @@ BACKWARD = {OperatingState.Sync_Backward, OperatingState.Backward}
 
 @pure
 @pytest.mark.parametrize("has_direction", [True, False])
-@pytest.mark.parametrize("speed", [0, 1, 40_583, 131_071, 131_072, 131_073, 1_000_000, 0xFFFF_FFFF])
+@pytest.mark.parametrize(
+    "speed",
+    [0, 1, 40_583, 131_071, 131_072, 131_073, 1_000_000, 0xFFFF_FFFF],
+)
 def test_rpm_is_negative_in_the_backward_states_only(
-    is_pure: bool, has_direction: bool, speed: int
+    is_pure: bool,
+    has_direction: bool,
+    speed: int,
 ) -> None:
     measuring = Measuring(wire.STATUS, is_pure, has_direction=has_direction)
     for state in (*range(32), 0x96, 0xFF):
         got = measuring.read(LiveData(speed, operating_state=state), 0)
-        negative = has_direction and state in BACKWARD
-        assert got.rpm == (max(-speed, -131_072) if negative else min(speed, 131_071))
+        if has_direction and state in BACKWARD:
+            assert got.rpm == max(-speed, -131_072)
+        else:
+            assert got.rpm == min(speed, 131_071)
 
 
 def half(value: float) -> float:
-    """The nearest number of a 16-bit float."""
+    """Return the nearest number of a 16-bit float."""
     found: float = struct.unpack("<e", struct.pack("<e", value))[0]
     return found
 
@@ -128,13 +153,16 @@ def half(value: float) -> float:
 @pure
 def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
     rng = random.Random(1)
-    status, extended = (Measuring(k, is_pure) for k in (wire.STATUS, wire.STATUS_EXTENDED))
+    status = Measuring(wire.STATUS, is_pure)
+    extended = Measuring(wire.STATUS_EXTENDED, is_pure)
     for _ in range(500):
         live = random_live(rng)
         live = live._replace(throttle=max(-127, live.throttle))
-        index, errors = rng.randrange(32), rng.choice((0, 1, 300, (1 << 32) - 1))
+        index = rng.randrange(32)
+        errors = rng.choice((0, 1, 300, (1 << 32) - 1))
         got = status.read(live, index, errors)
-        volts, amperes = live.battery_voltage / 100, live.battery_current / 10
+        volts = live.battery_voltage / 100
+        amperes = live.battery_current / 10
         kelvin = live.power_stage_temperature + 273.15
         found = (got.error_count, got.voltage, got.current, got.temperature, got.esc_index)
         assert found == (errors, half(volts), half(amperes), half(kelvin), index)
@@ -142,10 +170,13 @@ def test_random_measurements_are_read_as_they_were_sent(is_pure: bool) -> None:
         rpm = -live.electrical_speed if is_backward else live.electrical_speed
         assert got.rpm == max(-131_072, min(rpm, 131_071))
         assert got.power_rating_pct == min(live.output_opening, 127)
-        got, word = extended.read(live, index), live.operating_errors
+        got = extended.read(live, index)
+        word = live.operating_errors
         assert got.input_pct == abs(live.throttle)
         assert got.output_pct == min(live.output_opening, 127)
-        assert (got.motor_temperature_degC, got.motor_angle, got.esc_index) == (-256, 0, index)
+        assert got.motor_temperature_degC == -256
+        assert got.motor_angle == 0
+        assert got.esc_index == index
         assert got.status_flags == word & 0x3FFFF | (word > 0x3FFFF) << 18
 
 
@@ -156,7 +187,7 @@ def request(source: int, name: bytes, number: int = 1) -> list[CanFrame]:
 
 
 def received(frames: Iterable[CanFrame], pause_ns: int = 0) -> list[bytes]:
-    """What comes of frames, each of which comes so long after the one before."""
+    """Return the transfers of frames that arrive with this pause in between."""
     assembler = Assembler()
     seed = wire.GET_SET.seed
     found = [
@@ -166,8 +197,8 @@ def received(frames: Iterable[CanFrame], pause_ns: int = 0) -> list[bytes]:
     return [each for each in found if each is not None]
 
 
-def test_transfers_of_the_package_are_put_together_however_they_are_mixed() -> None:
-    """Transfers of several nodes with frames in between, some doubled; each comes out once, whole."""
+def test_transfers_are_assembled_from_mixed_frames() -> None:
+    """Frames of several nodes are mixed, and some are repeated. Each transfer is read once."""
     rng = random.Random(2)
     wanted: list[bytes] = []
     mixed: list[CanFrame] = []
@@ -180,7 +211,8 @@ def test_transfers_of_the_package_are_put_together_however_they_are_mixed() -> N
     while streams:
         stream = rng.choice(streams)
         frame = stream.pop(0)
-        mixed += [frame] * (rng.choice([1, 1, 2]) if len(frame.data) == 8 else 1)
+        count = rng.choice([1, 1, 2]) if len(frame.data) == 8 else 1
+        mixed += [frame] * count
         streams = [each for each in streams if each]
     assert sorted(received(mixed)) == sorted(wanted)
 

@@ -1,4 +1,4 @@
-"""The output in its gateway: configuration, `check`, other outputs, captures, `status`, and what it costs when it is off."""
+"""The DroneCAN output in a gateway: configuration, `check`, captures, and its cost when off."""
 
 import json
 import random
@@ -58,7 +58,8 @@ def checked(
 def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
     more = "node_id = 42\nfirst_index = 4\nextended_hz = 10"
     code, out, err = checked(tmp_path, more, "--json")
-    assert (code, err) == (0, "")
+    assert err == ""
+    assert code == 0
     found = json.loads(out)
     lines = found["outputs"]["dronecan"]
     (node,) = [line for line in lines if line.startswith("node 42, kontronik_can_gw, unique id")]
@@ -67,7 +68,8 @@ def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
     assert "rpm is motor_speed, at most 131071" in "".join(lines)
     # 2 x (50 x (8, 8, 3 bytes) + 10 x 8 bytes + 8 + 6 bytes) + 8 bytes, 29 bits, worst stuffing
     bits = 2 * (50 * (160 + 160 + 110) + 10 * 160 + 160 + 140) + 160
-    assert (found["bus_load"], found["frames_per_second"]) == (pytest.approx(bits / 1e6), 325)
+    assert found["bus_load"] == pytest.approx(bits / 1e6)
+    assert found["frames_per_second"] == 325
 
 
 @pytest.mark.parametrize(
@@ -89,7 +91,7 @@ def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
         ("", {}, 0, "give each gateway on a bus its own dronecan.name"),
     ],
 )
-def test_check_warns_of_what_is_unusual(
+def test_check_warns_of_unusual_settings(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     more: str,
@@ -97,12 +99,15 @@ def test_check_warns_of_what_is_unusual(
     code: int,
     said: str,
 ) -> None:
-    """As that a machine has no id, so that unique ids come from names alone."""
+    """One warning is for a machine without an id, whose unique ids depend on names alone."""
     if not given:
         monkeypatch.setattr("kontronik_can_gw.assembly.this_machine.identity_digest", lambda: b"")
     found, _, err = checked(tmp_path, f"node_id = 42\n{more}", **given)  # type: ignore[arg-type]
     assert found == code
-    assert said in err if said else not err
+    if said:
+        assert said in err
+    else:
+        assert not err
 
 
 @pytest.mark.parametrize(
@@ -130,7 +135,10 @@ def test_a_mistake_is_refused_in_one_line(table: dict[str, Any], reason: str) ->
     ],
 )
 def test_a_dbc_whose_ids_are_frames_of_our_node_is_refused(
-    tmp_path: Path, can_id: int, more: str, user: str
+    tmp_path: Path,
+    can_id: int,
+    more: str,
+    user: str,
 ) -> None:
     (tmp_path / "own.dbc").write_text(DBC.format(number=can_id + (1 << 31)))
     code, _, err = checked(tmp_path, more, dbc='file = "own.dbc"')
@@ -139,12 +147,19 @@ def test_a_dbc_whose_ids_are_frames_of_our_node_is_refused(
 
 
 @pytest.mark.parametrize("is_on", [False, True])
-def test_nothing_of_it_is_loaded_when_it_is_off_and_openssl_never(is_on: bool) -> None:
+def test_its_modules_are_only_loaded_if_it_is_on_and_openssl_never(is_on: bool) -> None:
+    tables = {
+        "can": {"interface": "virtual"},
+        "dronecan": {"enabled": is_on},
+        "esc": [{"port": "p"}],
+    }
     code = (
-        "import sys\nfrom kontronik_can_gw.assembly.assemble import assemble\nfrom kontronik_can_gw.config.parse import parse\n"
+        "import sys\n"
+        "from kontronik_can_gw.assembly.assemble import assemble\n"
+        "from kontronik_can_gw.config.parse import parse\n"
         "import kontronik_can_gw.cli.run, kontronik_can_gw.gateway.gateway\n"
         "import kontronik_can_gw.runtime.loop, kontronik_can_gw.assembly.capture_setup\n"
-        f"assemble(parse({{'can': {{'interface': 'virtual'}}, 'dronecan': {{'enabled': {is_on}}}, 'esc': [{{'port': 'p'}}]}}, 'a.toml'))\n"
+        f"assemble(parse({tables!r}, 'a.toml'))\n"
         "print('hashlib' in sys.modules, any('dronecan' in m for m in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -152,12 +167,19 @@ def test_nothing_of_it_is_loaded_when_it_is_off_and_openssl_never(is_on: bool) -
 
 
 @pytest.mark.parametrize("canopen", [False, True])
-def test_other_outputs_send_what_they_send_without_it(canopen: bool) -> None:
-    """Every 11-bit frame, its bytes and its time; SDO answers too."""
+def test_other_outputs_send_the_same_frames_with_and_without_it(canopen: bool) -> None:
+    """Every 11-bit frame has the same bytes and time. SDO answers are included."""
     found = []
     for enabled in (True, False):
-        given = loaded(2, dbc=True, canopen=canopen, enabled=enabled, extended_hz=33)
-        bench, rng = Bench(2, given=given), random.Random(6)
+        given = loaded(
+            2,
+            dbc=True,
+            canopen=canopen,
+            enabled=enabled,
+            extended_hz=33,
+        )
+        bench = Bench(2, given=given)
+        rng = random.Random(6)
         for _ in range(80):
             for esc in range(2):
                 live = LIVE._replace(electrical_speed=rng.randrange(70_000))
@@ -177,7 +199,10 @@ def test_other_outputs_send_what_they_send_without_it(canopen: bool) -> None:
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("node_id", [42, 0])
 def test_a_replay_is_identical_to_the_run(seed: int, node_id: int) -> None:
-    """On a bus where anything comes, with node-IDs of an allocator too; at its seed, from the bytes of the capture."""
+    """The bus has random frames, and an allocator may set the node-IDs.
+
+    The replay uses the bytes of the capture and its seed.
+    """
     setup, layout = capture_bench.made(2, canopen=bool(seed), dronecan=ON | {"node_id": node_id})
     bench = capture_bench.Bench(setup, layout).live(seed, 6)
     frames = [frame for frame in replayed(bench) if not frame.received]
@@ -185,20 +210,22 @@ def test_a_replay_is_identical_to_the_run(seed: int, node_id: int) -> None:
     assert sum(each.frame.extended for each in frames) > (0 if node_id == 0 else 300)
 
 
-def test_the_header_makes_the_same_nodes_on_any_machine() -> None:
+def test_a_capture_header_gives_the_same_nodes_on_any_machine() -> None:
     setup, _ = capture_bench.made(2, dronecan=ON)
     header: dict[str, Any] = json.loads(json.dumps(setup.header()))
     assert CaptureSetup.of(header).outputs == setup.outputs
     ours = header["outputs"].pop("dronecan")
     assert CaptureSetup.of(header).outputs == ()  # as in a capture of 0.5.0
     wrong = ({"table": {"rate_hz": 0}}, {"identity": "zz"}, {"seed": -1}, {"version": 6})
-    for outputs in (*({"dronecan": ours | change} for change in wrong), {"xyzzy": {}}, 7):
+    invalid: list[Any] = [{"dronecan": ours | change} for change in wrong]
+    invalid += [{"xyzzy": {}}, 7]
+    for outputs in invalid:
         with pytest.raises(ValueError, match="the header cannot be used"):
             CaptureSetup.of(header | {"outputs": outputs})
 
 
 def test_measurements_do_not_need_python() -> None:
-    """Whole turns in C go on: the core sends what is measured, and Python speaks once a second."""
+    """Turns in C continue: the core sends the measurements, and Python sends once a second."""
     bench = Bench(2, extended_hz=20)
     if bench.gateway.core.language != "C":
         pytest.skip(bench.gateway.core_note)
@@ -214,19 +241,21 @@ def test_measurements_do_not_need_python() -> None:
     for _ in range(1000):
         bench.run(0.01)
         spoken.add(bench.gateway.next_deadline(with_core=False))
-    assert len(followed) == 2  # of 2000 live frames the first of each ESC
+    assert len(followed) == 2  # the first of 1000 live frames of each ESC
     assert len(spoken) <= 11
     assert len(bench.of("Status")) == 2 * 500
     assert len(bench.of("StatusExtended")) in (2 * 200, 2 * 201)
 
 
 @pytest.mark.parametrize("is_pure", ["0", "1"])
-def test_a_bus_that_is_too_slow_gets_whole_transfers(
-    is_pure: str, monkeypatch: pytest.MonkeyPatch
+def test_a_bus_that_is_too_slow_gets_complete_transfers(
+    is_pure: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of two ESCs, of which the newer values win: what is begun ends as it began."""
+    """Newer values of two ESCs replace waiting ones, but a transfer that began is completed."""
     monkeypatch.setenv("KONTRONIK_PURE", is_pure)
-    world, setup = wire_world.World(2), loaded(2)
+    world = wire_world.World(2)
+    setup = loaded(2)
     layout = Layout("", "", ())
     loop = wire_world.loop_in(world, monkeypatch, setup.escs, layout, outputs=setup.outputs)
     loop.open()
@@ -235,7 +264,7 @@ def test_a_bus_that_is_too_slow_gets_whole_transfers(
     for wire in world.wires:
         wire.stream(begun, begun + 5 * SECOND, 10 * MS)
     wire_world.run(loop, world, begun + SECOND)
-    world.bus.frame_ns = 5 * MS  # 200 a second, of 300
+    world.bus.frame_ns = 5 * MS  # 200 of 300 frames a second
     wire_world.run(loop, world, begun + 5 * SECOND)
     assembler = Assembler()
     sent = [frame for _, frame in world.bus.sent if frame.can_id == 0x18040A2A]

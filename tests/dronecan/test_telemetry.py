@@ -1,4 +1,4 @@
-"""What is sent of ESCs, as the package ``dronecan`` reads it: values, when, and when not."""
+"""Telemetry that the package ``dronecan`` reads: its values, its times, and when it is not sent."""
 
 import math
 
@@ -14,19 +14,21 @@ from kontronik_can_gw.times import MS, SECOND
 
 HOT = OperatingError.POWER_STAGE_OVERTEMP_ERROR
 WARM = OperatingError.POWER_STAGE_OVERTEMP_WARNING
-HOT_NOW, WARM_NOW = (LIVE._replace(operating_errors=1 << bit) for bit in (HOT, WARM))
+HOT_NOW = LIVE._replace(operating_errors=1 << HOT)
+WARM_NOW = LIVE._replace(operating_errors=1 << WARM)
 
 
 @pytest.mark.parametrize("per_esc_nodes", [False, True])
-def test_all_escs_are_sent_at_one_rate_while_telemetry_is_fresh_and_no_longer(
+def test_all_escs_are_sent_at_one_rate_while_telemetry_is_fresh(
     per_esc_nodes: bool,
 ) -> None:
-    """The last value is sent within the ESC's time-out; then there is silence, the other ESC goes on."""
+    """The last value is sent within the ESC's time-out. The other ESC is still sent after that."""
     bench = Bench(2, per_esc_nodes=per_esc_nodes).run(1)
     assert bench.intervals("Status") == {0, 20 * MS}
     order = [(each.source, each.payload.esc_index) for each in bench.of("Status")]
     assert order == [(42, 0), (42 + per_esc_nodes, 1)] * 50
-    bench.live[0], lost = None, bench.now
+    bench.live[0] = None
+    lost = bench.now
     bench.clear()
     bench.run(2)
     of_first = [each for each in bench.of("Status") if each.payload.esc_index == 0]
@@ -38,11 +40,21 @@ def test_all_escs_are_sent_at_one_rate_while_telemetry_is_fresh_and_no_longer(
 
 
 @pytest.mark.parametrize(
-    ("rpm", "speed"), [("motor", 6000), ("output", 600), ("electrical", 42_000)]
+    ("rpm", "speed"),
+    [("motor", 6000), ("output", 600), ("electrical", 42_000)],
 )
-@pytest.mark.parametrize(("negative_rpm", "sign"), [(True, -1), (False, 1)])
-def test_rpm_of_a_motor_that_turns_backward_is_negative_unless_that_is_off(
-    rpm: str, speed: int, negative_rpm: bool, sign: int
+@pytest.mark.parametrize(
+    ("negative_rpm", "sign"),
+    [
+        (True, -1),
+        (False, 1),
+    ],
+)
+def test_rpm_of_a_backward_motor_is_negative_unless_that_is_off(
+    rpm: str,
+    speed: int,
+    negative_rpm: bool,
+    sign: int,
 ) -> None:
     """The motor is started forward, reversed, and started forward again."""
     bench = Bench(rpm=rpm, negative_rpm=negative_rpm)
@@ -54,9 +66,21 @@ def test_rpm_of_a_motor_that_turns_backward_is_negative_unless_that_is_off(
     assert seen == [{speed}, {sign * speed}, {speed}]
 
 
-@pytest.mark.parametrize(("rate_hz", "live_ms"), [(50, 50), (50, 14), (100, 10), (30, 10), (7, 10)])
-def test_the_rate_is_kept_on_average_whatever_comes(rate_hz: int, live_ms: int) -> None:
-    """By frames of the ESC where one comes at about the time, else by the clock; StatusExtended by choice only."""
+@pytest.mark.parametrize(
+    ("rate_hz", "live_ms"),
+    [
+        (50, 50),
+        (50, 14),
+        (100, 10),
+        (30, 10),
+        (7, 10),
+    ],
+)
+def test_the_rate_is_kept_on_average_at_any_rate_of_telemetry(rate_hz: int, live_ms: int) -> None:
+    """A frame of the ESC causes a Status if it arrives at about the right time, else the clock.
+
+    StatusExtended is sent only if configured.
+    """
     bench = Bench(rate_hz=rate_hz, extended_hz=10 * (rate_hz == 30))
     bench.live[0] = None
     for number in range(10_000 // live_ms):
@@ -68,19 +92,29 @@ def test_the_rate_is_kept_on_average_whatever_comes(rate_hz: int, live_ms: int) 
     assert 0 <= min(late) < max(late) + 1 <= live_ms * MS + 1
 
 
-@pytest.mark.parametrize(("device", "amperes"), [(Device.KOSMIK, 1.25), (Device.JIVEPRO, math.nan)])
-def test_the_bec_once_a_second_and_what_a_device_does_not_supply_is_nan(
-    device: Device, amperes: float
+@pytest.mark.parametrize(
+    ("device", "amperes"),
+    [
+        (Device.KOSMIK, 1.25),
+        (Device.JIVEPRO, math.nan),
+    ],
+)
+def test_the_bec_is_sent_once_a_second_with_nan_for_missing_values(
+    device: Device,
+    amperes: float,
 ) -> None:
     bench = Bench(first_index=2)
     bench.hear(InfoData(device_and_variant=device_and_variant(device, 1)))
     bench.live[0] = LIVE._replace(operating_errors=1 << OperatingError.BEC_UNDERVOLTAGE | 1 << 9)
     bench.run(3)
-    circuit, warm = bench.of("CircuitStatus")[-1].payload, bench.of("Temperature")[-1].payload
-    assert (circuit.circuit_id, circuit.error_flags) == (2, 2)
+    circuit = bench.of("CircuitStatus")[-1].payload
+    warm = bench.of("Temperature")[-1].payload
+    assert circuit.circuit_id == 2
+    assert circuit.error_flags == 2
     assert circuit.voltage == pytest.approx(5.981, abs=0.004)
     assert circuit.current == pytest.approx(amperes, abs=0.001, nan_ok=True)
-    assert (warm.device_id, warm.error_flags) == (2, 1)
+    assert warm.device_id == 2
+    assert warm.error_flags == 1
     assert warm.temperature == pytest.approx(314.15, abs=0.25)
     assert len(bench.of("CircuitStatus")) == len(bench.of("Temperature")) == 4
     assert max(bench.intervals("CircuitStatus")) == SECOND
@@ -89,11 +123,19 @@ def test_the_bec_once_a_second_and_what_a_device_does_not_supply_is_nan(
 @pytest.mark.parametrize(
     ("flight", "counts"),
     [
-        # (errors, electrical speed) of each second, None: nothing is heard
+        # (errors, electrical speed) of each second, or None without telemetry
         (
             [
-                *((0, 0), (1 << HOT, 0), (0, 0), (0, 700), (1 << HOT, 700), (1 << WARM, 700)),
-                *((1 << HOT | 1, 700), (1 << HOT | 1, 700), (0, 0), (0, 700)),
+                (0, 0),
+                (1 << HOT, 0),
+                (0, 0),
+                (0, 700),
+                (1 << HOT, 700),
+                (1 << WARM, 700),
+                (1 << HOT | 1, 700),
+                (1 << HOT | 1, 700),
+                (0, 0),
+                (0, 700),
             ],
             [0, 1, 1, 0, 1, 1, 3, 3, 3, 0],
         ),
@@ -102,12 +144,14 @@ def test_the_bec_once_a_second_and_what_a_device_does_not_supply_is_nan(
             [0, 0, 0, 0, 1, 1, 2],
         ),
     ],
-    ids=["the motor is started anew", "telemetry comes back with errors"],
+    ids=["the motor is started again", "telemetry returns with errors"],
 )
-def test_error_count_is_that_of_errors_since_the_motor_was_started(
-    flight: list[tuple[int, int] | None], counts: list[int]
+def test_error_count_counts_errors_since_the_motor_was_started(
+    flight: list[tuple[int, int] | None],
+    counts: list[int],
 ) -> None:
-    bench, found = Bench(), []
+    bench = Bench()
+    found = []
     for second in flight:
         bench.live[0] = None
         if second is not None:
@@ -117,26 +161,34 @@ def test_error_count_is_that_of_errors_since_the_motor_was_started(
 
 
 @pytest.mark.parametrize("health", ["gateway", "esc"])
-def test_errors_of_an_esc_count_in_health_by_choice_only(health: str) -> None:
+def test_errors_of_an_esc_change_health_only_if_configured(health: str) -> None:
     bench = Bench(2, per_esc_nodes=True, health=health).run(0.5)
     found = []
     for bench.live[0] in (LIVE, WARM_NOW, HOT_NOW, None):
         bench.run(1.5)
         found.append([bench.of("NodeStatus", node)[-1].payload.health for node in (42, 43)])
-    by_choice = [[0, 0], [1, 0], [2, 0], [1, 0]]
-    assert found == (by_choice if health == "esc" else [[0, 0]] * 4)
+    expected = [[0, 0]] * 4
+    if health == "esc":
+        expected = [[0, 0], [1, 0], [2, 0], [1, 0]]
+    assert found == expected
     assert {each.payload.mode for each in bench.of("NodeStatus")} == {wire.OPERATIONAL}
 
 
-def test_a_node_says_each_second_that_it_is_there_and_how_the_gateway_is() -> None:
-    """Without telemetry nothing else; its first bits of the errors; at the end that it goes."""
+def test_a_node_sends_its_status_and_the_gateways_health_each_second() -> None:
+    """Without telemetry it sends nothing else.
+
+    NodeStatus has the lowest error bits, and at the end the node reports that it is offline.
+    """
     bench = Bench()
     bench.live[0] = None
     bench.run(2)
-    assert ({each.name for each in bench.read}, bench.read[0].at) == ({"NodeStatus"}, START)
+    assert {each.name for each in bench.read} == {"NodeStatus"}
+    assert bench.read[0].at == START
     bench.live[0] = LIVE._replace(operating_errors=1 << HOT | 1 << 17)
     got = bench.run(1.5).of("NodeStatus")[-1].payload
-    assert (got.uptime_sec, got.health, got.vendor_specific_status_code) == (3, 0, 1 << HOT)
+    assert got.uptime_sec == 3
+    assert got.health == 0
+    assert got.vendor_specific_status_code == 1 << HOT
     assert bench.intervals("NodeStatus") == {SECOND}
     for state, health in ((CanState.ERROR_PASSIVE, 1), (CanState.ERROR_ACTIVE, 0)):
         bench.gateway.set_can_state(state, bench.now)
@@ -149,9 +201,10 @@ def test_a_node_says_each_second_that_it_is_there_and_how_the_gateway_is() -> No
 
 @pytest.mark.parametrize("is_pure", [True, False])
 def test_transfer_ids_count_from_0_to_31_for_each_message_of_a_node(
-    is_pure: bool, monkeypatch: pytest.MonkeyPatch
+    is_pure: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A receiver takes a transfer with the id of the one before for a repetition."""
+    """A receiver takes a transfer with the same id as the one before for a repetition."""
     monkeypatch.setenv(load.PURE, str(int(is_pure)))
     load.library.cache_clear()
     bench = Bench(2, extended_hz=5).run(70)
@@ -166,32 +219,32 @@ def test_transfer_ids_count_from_0_to_31_for_each_message_of_a_node(
     assert texts == list(range(len(texts))) != []
 
 
-def test_what_waited_while_the_process_was_held_up_is_made_anew() -> None:
-    """Nothing is made up for: one Status, of what is fresh then."""
+def test_values_that_waited_in_a_hold_up_are_not_sent() -> None:
+    """No frame is sent later in place of a missed one, and only fresh values are sent."""
     bench = Bench().run(1)
     bench.clear()
     bench.now += 3 * SECOND
     bench.gateway.held_up(bench.now, True)
     bench.gateway.advance(bench.now)
     bench.take()
-    assert not bench.of("Status")  # what was heard is three seconds old
+    assert not bench.of("Status")  # the telemetry is three seconds old
     assert len(bench.of("NodeStatus")) == 1
     assert len(bench.run(0.1).of("Status")) == 5
 
 
 def text_of(bench: Bench) -> str:
-    """All that was logged since the bench was cleared."""
+    """Return all log messages since the bench was cleared, and clear it."""
     texts = [bytes(each.payload.text.to_bytes()).decode() for each in bench.of("LogMessage")]
     assert all(len(text) <= 90 for text in texts)
     bench.clear()
     return " ".join(texts)
 
 
-def test_errors_that_begin_and_end_are_logged_with_the_remedy() -> None:
-    """Not those of the other severities; neither begun nor over while nothing is known."""
+def test_errors_are_logged_with_the_remedy_when_they_begin_and_end() -> None:
+    """Bits of other severities are not logged. Without telemetry no error begins or ends."""
     bench = Bench().run(0.5)
     assert not bench.of("LogMessage")
-    bench.live[0] = LIVE._replace(operating_errors=1 << HOT | 1 << 12)  # and its summary
+    bench.live[0] = LIVE._replace(operating_errors=1 << HOT | 1 << 12)  # with the summary bit
     got = [each.payload for each in bench.run(2).of("LogMessage")]
     assert {(each.level.value, bytes(each.source.to_bytes())) for each in got} == {(3, b"e0")}
     assert text_of(bench) == f"e0: {HOT.meaning}. {HOT.remedy}"
@@ -208,7 +261,7 @@ def test_errors_that_begin_and_end_are_logged_with_the_remedy() -> None:
 
 
 def test_a_bit_is_logged_at_most_each_ten_seconds() -> None:
-    """One that comes and goes all the time; one that is on when the bus returns."""
+    """One bit flaps all the time, and another one is on when the bus returns."""
     bench = Bench()
     for turn in range(600):
         bench.live[0] = LIVE._replace(operating_errors=turn % 2 << WARM)
@@ -223,14 +276,14 @@ def test_a_bit_is_logged_at_most_each_ten_seconds() -> None:
 
 
 @pytest.mark.parametrize("is_bus_off", [False, True])
-def test_errors_that_began_while_nothing_reached_the_bus_are_logged_when_it_returns(
+def test_errors_during_a_bus_outage_are_logged_when_the_bus_returns(
     is_bus_off: bool,
 ) -> None:
     bench = Bench().run(0.5)
     bench.gateway.set_can_state(CanState.BUS_OFF if is_bus_off else CanState.DOWN, bench.now)
     bench.live[0] = WARM_NOW
     bench.run(3)
-    bench.clear()  # what a bus that is off did not take
+    bench.clear()  # discards frames that a bus in bus-off did not take
     assert text_of(bench.run(15)) == ""
     if is_bus_off:
         bench.gateway.set_can_state(CanState.ERROR_ACTIVE, bench.now)

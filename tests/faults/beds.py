@@ -1,4 +1,4 @@
-"""The beds that the faults of the programme share: each makes a bench with a running gateway."""
+"""The beds of the fault programme. Each bed creates a bench with a running gateway."""
 
 import contextlib
 import functools
@@ -19,11 +19,11 @@ from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.states import Device
 
 WITHOUT_OVERRIDE = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")
-"""Root that file permissions hold for."""
+"""Command prefix for a root process that file permissions apply to."""
 IDENTITIES = (Identity(1), Identity(2, Layout.LEGACY, Device.JIVEPRO, 12, alarms=True))
 ADAPTER_RATE = 500_000
 table = functools.cache(table_sent)
-"""Of the shipped layouts."""
+"""Return the table of a shipped layout. It is computed once."""
 _numbers = itertools.count()
 MakesBench = Callable[[Path], contextlib.AbstractContextManager[Bench]]
 Injects = Callable[[Any, Any, Any], None]
@@ -34,7 +34,10 @@ def run(command: str) -> None:
 
 
 def make_pair(gateway_end: str, far_end: str) -> None:
-    """A CAN cable: what is sent at one end comes out at the other. The gateway's end is down."""
+    """Create a CAN cable that carries frames between two interfaces.
+
+    The gateway's end is down.
+    """
     run(f"ip link add {gateway_end} type vxcan peer name {far_end}")
     run(f"ip link set {far_end} up")
 
@@ -46,16 +49,16 @@ def bench_of(
     names: tuple[str, str] | None = None,
     **options: Any,
 ) -> Iterator[Bench]:
-    """A running gateway with these ESCs on a CAN cable, or on interfaces that are there."""
+    """Yield a running gateway with these ESCs, on a CAN cable or on existing interfaces."""
     number = next(_numbers)
     near, far = names or (f"gw{number}", f"far{number}")
     if names is None:
         make_pair(near, far)
         run(f"ip link set {near} up")
     folder = Path(tempfile.mkdtemp(prefix="ports."))
-    ports = [
-        PtyPort(folder / f"esc{i + 1}", identity, rate_hz) for i, identity in enumerate(identities)
-    ]
+    ports = []
+    for number, identity in enumerate(identities, 1):
+        ports.append(PtyPort(folder / f"esc{number}", identity, rate_hz))
     known = table(("--esc", str(len(ports))), options.get("canopen", True), len(ports))
     try:
         with Bench(near, far, ports, known, **options) as bench:
@@ -71,27 +74,26 @@ def two(_: Path) -> contextlib.AbstractContextManager[Bench]:
 
 
 def everything(folder: Path) -> contextlib.AbstractContextManager[Bench]:
-    """``two`` with recording and DroneCAN."""
+    """Return the bench of ``two`` with recording and DroneCAN."""
     record = f'[record]\ndirectory = "{folder / "captures"}"\nkeep_mb = 20\nmin_free_mb = 1\n'
-    return bench_of(
-        prefix=WITHOUT_OVERRIDE, more=record + "[dronecan]\nenabled = true\nnode_id = 100\n"
-    )
+    dronecan = "[dronecan]\nenabled = true\nnode_id = 100\n"
+    return bench_of(prefix=WITHOUT_OVERRIDE, more=record + dronecan)
 
 
 def eight(_: Path) -> contextlib.AbstractContextManager[Bench]:
-    """Slow ones: feeder and judge have the processor, too."""
+    """Return a bench with eight slow ESCs. Feeder and judge need the processor, too."""
     layouts = (Layout.V4, Layout.LEGACY)
     identities = [Identity(i + 1, layouts[i % 2]) for i in range(8)]
     return bench_of(identities, rate_hz=25, canopen=False)
 
 
 BUS: list[Bus] = []
-"""That of the bed ``adapters``, while there is one."""
+"""The bus of the bed ``adapters`` while that bed exists."""
 
 
 @contextlib.contextmanager
 def adapters(_: Path) -> Iterator[Bench]:
-    """One ESC, a gateway on an emulated adapter, the judge on another; the adapters are slow."""
+    """Yield a bench with one ESC and slow emulated adapters for the gateway and the judge."""
     number = next(_numbers)
     names = f"sl{number}", f"slfar{number}"
     BUS[:] = [Bus(*names)]
@@ -106,9 +108,17 @@ def adapters(_: Path) -> Iterator[Bench]:
 
 
 def fault(
-    area: str, name: str, limit_s: float | None, *, bed: MakesBench = two, **further: Any
+    area: str,
+    name: str,
+    limit_s: float | None,
+    *,
+    bed: MakesBench = two,
+    **further: Any,
 ) -> Callable[[Injects], Injects]:
-    """Register a function as a fault; when its cause is ``cleared``, its recovery is waited for."""
+    """Register a function as a fault.
+
+    After its cause is ``cleared``, the programme waits for the recovery.
+    """
 
     def register(inject: Injects) -> Injects:
         FAULTS.append(Fault(area, name, limit_s, inject, bed, **further))

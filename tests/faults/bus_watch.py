@@ -1,7 +1,11 @@
-"""Judges every frame on a bus: a value is marked not available, or it is what an ESC sent a moment ago. Everything else is a wrong value.
+"""Judges every frame on a bus.
 
-``Judge`` is pure: frames and times in. ``BusWatch`` reads a socket in a thread; times are monotonic nanoseconds at which it has read a
-frame, so what it loses itself counts against the gateway: never the other way.
+A value is right if it is marked as not available, or if an ESC sent it within the time-out. Any
+other value is wrong.
+
+``Judge`` is pure: it gets frames and times. ``BusWatch`` reads a socket in a thread. Its times are
+monotonic nanoseconds at which it has read a frame. A frame that it loses itself counts against the
+gateway, never in favour of it.
 """
 
 import contextlib
@@ -22,7 +26,7 @@ SECOND = 1000 * MS
 TIMEOUT_NS = 250 * MS
 INFO_TIMEOUT_NS = 10 * SECOND
 LOOKED_BACK = 3000
-"""So many frames are searched to say where a wrong value comes from."""
+"""Number of frames that are searched for the origin of a wrong value."""
 KEPT = 100
 
 _FOLLOWS = {"Speed": SPEED, "Current": CURRENT}
@@ -36,7 +40,7 @@ class Wrong(NamedTuple):
 
 
 class Fresh(NamedTuple):
-    """A right value frame: when, and the number of the live frame that it is from."""
+    """A frame with right values: its time, and the number of the live frame it is based on."""
 
     at_ns: int
     n: int
@@ -48,57 +52,66 @@ class Emergency(NamedTuple):
     code: int
 
 
-class Said(NamedTuple):
-    """A frame with an ESC's values: the time, the message, and what is not marked as not available."""
+class Received(NamedTuple):
+    """A frame with an ESC's values: time, message and the available values."""
 
     at_ns: int
     message: Message
     esc: int
     present: list[tuple[str, float, float]]
-    """Name, value and half a step."""
+    """Name, value and half a step of each available signal."""
     flags: int | None
-    """The error bits, where the message has any and they hold."""
+    """The error bits, or None if the message has no valid ones."""
 
     def __str__(self) -> str:
         values = ", ".join(f"{name} {value:g}" for name, value, _ in self.present)
         return f"{self.message.name}: {values}"
 
-    def is_of(self, values: dict[str, float]) -> bool:
+    def has_values(self, values: dict[str, float]) -> bool:
         same = all(abs(values[name] - value) <= half for name, value, half in self.present)
         return same and (self.flags is None or self.flags == values["flags"])
 
 
 class Judge:
-    """What was sent, what came, and whether it is right. ``slack_ns``: what the machine is given on top of the time-out."""
+    """Compares received frames with the frames that the ESCs sent.
 
-    def __init__(self, table: Table, escs: Sequence[FedEsc], slack_ns: int = 60 * MS) -> None:
+    ``slack_ns`` is the time that the machine may take in addition to the time-out.
+    """
+
+    def __init__(
+        self,
+        table: Table,
+        escs: Sequence[FedEsc],
+        slack_ns: int = 60 * MS,
+    ) -> None:
         self.table = table
         self.escs = escs
         self.slack_ns = slack_ns
         self.more_ns = 0
-        """Slack besides, for a while: what a bus or an adapter holds nobody can take back."""
+        """Additional slack for a while: frames in a bus or an adapter cannot be taken back."""
         self.by_more = 0
-        """Values that were right only because of it."""
+        """Values that were right only because of the additional slack."""
         self.wrong: deque[Wrong] = deque(maxlen=KEPT)
-        """The newest ones."""
+        """The newest wrong values."""
         self.wrong_count = 0
         self.values = 0
-        """Frames with values that were compared and right."""
+        """Number of frames whose values were right."""
         self.marked = 0
-        """Frames in which all values were marked not available."""
+        """Number of frames whose values were all marked as not available."""
         self.boot_ups: list[tuple[int, int]] = []
-        """(time, node)"""
+        """Time and node of each boot-up."""
         self.emergencies: list[Emergency] = []
         self.fresh: list[deque[Fresh]] = [deque(maxlen=5_000) for _ in escs]
-        """The EscSpeed frames that were right."""
-        # CAN id -> number of the newest live frame that it has carried
+        """The right EscSpeed frames of each ESC."""
         self._newest: dict[int, int] = {}
-        self._bits: dict[str, tuple[Message, int]] = {}  # message name -> message, content
+        """Number of the newest live frame that each CAN id has carried."""
+        self._bits: dict[str, tuple[Message, int]] = {}
+        """Newest message and content by name of the message."""
         self._nodes = set(range(1, len(escs) + 1))
         self._devices: list[int | None] = [None for _ in escs]
 
     def take(self, can_id: int, data: bytes, at_ns: int) -> None:
-        """A classic frame with an 11-bit identifier that the gateway has sent."""
+        """Judge a classic frame with an 11-bit identifier that the gateway has sent."""
         bits = int.from_bytes(data, "little")
         if can_id - 0x700 in self._nodes and data == b"\0":
             self.boot_ups.append((at_ns, can_id - 0x700))
@@ -113,20 +126,32 @@ class Judge:
                 self._judge_age(message, at_ns)
 
     def value(self, message: str, signal: str) -> int | None:
-        """The newest raw value of a signal of the gateway's own messages or of ``EscNLink``; None before the first."""
+        """Return the newest raw value of a signal, or None before the first frame.
+
+        The message is one of the gateway's own messages or ``EscNLink``.
+        """
         found = self._bits.get(message)
         if found is None:
             return None
-        return next(place.raw(found[1]) for place in found[0].places if place.name == signal)
+        definition, bits = found
+        return next(place.raw(bits) for place in definition.places if place.name == signal)
 
     def info_device(self, esc: int) -> int | None:
-        """The device number that an ESC's newest right EscInfo told."""
+        """Return the device number of an ESC's newest right EscInfo."""
         return self._devices[esc]
 
-    def first_fresh(self, esc: int, after_ns: int, sent_after_ns: int = 0) -> Fresh | None:
-        """The first right value frame of an ESC after a time, of a live frame that was sent after another."""
+    def first_fresh(
+        self,
+        esc: int,
+        after_ns: int,
+        sent_after_ns: int = 0,
+    ) -> Fresh | None:
+        """Return the first frame with right values of an ESC after a time, or None.
+
+        Its live frame was sent at ``sent_after_ns`` or later.
+        """
         found = None
-        for fresh in reversed(tuple(self.fresh[esc])):  # a copy: the judge goes on meanwhile
+        for fresh in reversed(tuple(self.fresh[esc])):  # a copy, because the judge continues
             if fresh.at_ns <= after_ns:
                 break
             if self.escs[esc].sent[fresh.n] >= sent_after_ns:
@@ -149,61 +174,74 @@ class Judge:
             self.marked += 1
             return
         start, mask = message.flags
-        holds = mask and any(name in ("operating_state", "device") for name, _, _ in present)
+        are_valid = mask and any(name in ("operating_state", "device") for name, _, _ in present)
+        flags = (bits >> start & mask) if are_valid else None
         assert message.esc is not None
-        said = Said(at_ns, message, message.esc, present, (bits >> start & mask) if holds else None)
-        (self._judge_info if message.kind == "info" else self._judge_live)(said)
+        received = Received(at_ns, message, message.esc, present, flags)
+        if message.kind == "info":
+            self._judge_info(received)
+        else:
+            self._judge_live(received)
 
-    def _judge_live(self, said: Said) -> None:
-        fed, at_ns, can_id = self.escs[said.esc], said.at_ns, said.message.can_id
+    def _judge_live(self, received: Received) -> None:
+        fed = self.escs[received.esc]
+        at_ns = received.at_ns
+        can_id = received.message.can_id
         limit_ns = TIMEOUT_NS + self.slack_ns
         n = newest = fed.newest(at_ns + MS)
         while n >= 0 and at_ns - fed.sent[n] <= limit_ns + self.more_ns:
-            if said.is_of(fed.values(n)):
+            if received.has_values(fed.values(n)):
                 break
             n -= 1
         else:
-            self._is_wrong(at_ns, f"{said}: {self._origin(said, n, newest)}")
+            self._is_wrong(at_ns, f"{received}: {self._origin(received, n, newest)}")
             return
-        # where frames may come seconds late, several of them had these values: their order is not known
+        # If frames may arrive seconds late, several of them had these values, and their order is
+        # unknown.
         if not self.more_ns:
             newer = self._newest.get(can_id, -1)
             if n < newer:
-                self._is_wrong(at_ns, f"{said}: values of frame {n} after those of frame {newer}")
+                self._is_wrong(
+                    at_ns,
+                    f"{received}: values of frame {n} after those of frame {newer}",
+                )
                 return
             self._newest[can_id] = n
         self.values += 1
         self.by_more += at_ns - fed.sent[n] > limit_ns
-        follows = _FOLLOWS.get(said.message.stem, 0)
+        follows = _FOLLOWS.get(received.message.stem, 0)
         fed.seen[n] |= follows
         if follows == SPEED:
-            self.fresh[said.esc].append(Fresh(at_ns, n))
+            self.fresh[received.esc].append(Fresh(at_ns, n))
 
-    def _origin(self, said: Said, older: int, newest: int) -> str:
-        """Where values come from that none of the newest frames had."""
-        fed = self.escs[said.esc]
+    def _origin(self, received: Received, older: int, newest: int) -> str:
+        """Describe the origin of values that the newest frames did not have."""
+        fed = self.escs[received.esc]
         for n in range(older, max(-1, newest - LOOKED_BACK), -1):
-            if said.is_of(fed.values(n)):
-                return f"old: frame {n}, sent {(said.at_ns - fed.sent[n]) / SECOND:.3f} s before"
+            if received.has_values(fed.values(n)):
+                return (
+                    f"old: frame {n}, sent {(received.at_ns - fed.sent[n]) / SECOND:.3f} s before"
+                )
         return f"never sent; newest frame {newest}"
 
-    def _judge_info(self, said: Said) -> None:
-        fed = self.escs[said.esc]
-        m = newest = fed.newest_info(said.at_ns + MS)
-        while m >= 0 and said.at_ns - fed.info_sent[m] <= INFO_TIMEOUT_NS + self.slack_ns:
+    def _judge_info(self, received: Received) -> None:
+        fed = self.escs[received.esc]
+        m = newest = fed.newest_info(received.at_ns + MS)
+        while m >= 0 and received.at_ns - fed.info_sent[m] <= INFO_TIMEOUT_NS + self.slack_ns:
             values = fed.values_of_info(m)
-            if said.is_of(values):
+            if received.has_values(values):
                 self.values += 1
-                if said.message.stem == "Info":
-                    self._devices[said.esc] = int(values["device"])
+                if received.message.stem == "Info":
+                    self._devices[received.esc] = int(values["device"])
                 return
             m -= 1
-        self._is_wrong(said.at_ns, f"{said}: no info of the last 10 s; newest {newest}")
+        self._is_wrong(received.at_ns, f"{received}: no info of the last 10 s; newest {newest}")
 
     def _judge_age(self, message: Message, at_ns: int) -> None:
-        """The age of the data must not be told younger than what was sent last."""
+        """Check that the age of the data is not lower than the age of the newest frame."""
         age = self.value(message.name, "data_age")
-        assert message.esc is not None and age is not None
+        assert message.esc is not None
+        assert age is not None
         if age >= 65_000:
             return
         fed = self.escs[message.esc]
@@ -217,10 +255,12 @@ class Judge:
 
 
 class BusWatch(Judge):
-    """A judge with a socket on all interfaces, of which one is listened to: it may be deleted and made again meanwhile.
+    """A judge with a socket that receives frames of one interface.
 
-    ``ignore_local``: frames that were sent on the watched interface itself are foreign traffic and not judged. That is so where
-    the gateway is at the other end: of a vxcan pair, of a controller pair, of two adapters.
+    The socket is bound to all interfaces, so the watched one may be deleted and created again.
+    If ``ignore_local`` is set, frames that were sent on the watched interface itself are foreign
+    traffic and are not judged. That is the case if the gateway is at the other end of a vxcan pair,
+    a controller pair or two adapters.
     """
 
     def __init__(
@@ -253,7 +293,7 @@ class BusWatch(Judge):
     def _run(self) -> None:
         try:
             while not self._closed:
-                # an OSError: time out, or an interface went down or away; the socket is still good
+                # An OSError is a time-out or a lost interface. The socket remains usable.
                 with contextlib.suppress(OSError):
                     data, _, flags, address = self._socket.recvmsg(16)
                     self._received(data, flags, address[0])
@@ -270,7 +310,7 @@ class BusWatch(Judge):
             self.take(can_id & 0x7FF, content[:size], time.monotonic_ns())
 
     def catch_up(self) -> None:
-        """Wait until all that has come by now was judged."""
+        """Wait until all frames received so far were judged."""
         while self.failure is None and select.select([self._socket], [], [], 0)[0]:
             time.sleep(0.005)
         time.sleep(0.02)

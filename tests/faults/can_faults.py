@@ -1,6 +1,7 @@
-"""Faults of the CAN interface and of the bus behind it, hostile or broken traffic on it, and many ESCs of which some are ill.
+"""Faults of the CAN interface and its bus, hostile or broken traffic, and many ESCs with faults.
 
-What is wrong with the interface disturbs all ESCs, and the serial side must go on; by traffic and by others nobody is disturbed.
+A fault of the interface disturbs all ESCs, but the serial side must continue. Traffic of other
+devices must not disturb any ESC.
 """
 
 import contextlib
@@ -17,28 +18,35 @@ from raw_bus import ERROR_FLAG, RawBus
 from slcan_adapters import Adapter
 
 CONFLICT = 0x8150
-traffic = partial(fault, "Traffic", limit_s=None, escs=[], settle_s=1)
-ACTIVE, PASSIVE = 1, 3
+traffic = partial(
+    fault,
+    "Traffic",
+    limit_s=None,
+    escs=[],
+    settle_s=1,
+)
+ACTIVE = 1
+PASSIVE = 3
 BUS_OFF_LEFT = 0x8140
 MAX_IN_CONTROLLER = 6
-"""Frames that the kernel has taken and that nobody can take back: as many as the smallest send buffer that it grants holds."""
+"""Frames in the kernel that cannot be taken back: the capacity of its smallest send buffer."""
 SLOW_BITS_PER_S = 24_000
 HELD_NS = MAX_IN_CONTROLLER * 16 * 8 * SECOND // SLOW_BITS_PER_S
-"""How long a bus that slow takes for them, 16 bytes each: 32 ms."""
+"""Duration of these frames of 16 bytes on such a slow bus: 32 ms."""
 FREE = "1gbit"
 on_cable = partial(fault, "CAN", limit_s=1.0)
 on_adapter = partial(fault, "CAN", bed=adapters, settle_s=1)
 
 
 def still_answers(bench: Bench) -> None:
-    """The node's SDO server is as before."""
+    """Check that the node's SDO server still answers."""
     with RawBus(bench.watched) as master:
         found = master.read(1, 0x1000, 0)
         bench.expect(found == 0, f"object 1000h is {found}")
 
 
 def back_up(injection: Injection) -> None:
-    """The interface is up again, each node says that it has started anew, and hears."""
+    """Set the interface up, and check that each node boots and answers."""
     injection.cleared()
     run(f"ip link set {injection.bench.interface} up")
     injection.wait_recovery()
@@ -91,35 +99,41 @@ def bus_off(bench: Bench, injection: Injection, _n: int) -> None:
 
 @contextlib.contextmanager
 def slow_bus(injection: Injection, rate: str, held_ns: int) -> Iterator[None]:
-    """The bus takes no more than that; the kernel's queue is full soon, and then it says ENOBUFS. Free again, it keeps what waits.
+    """Limit the bus to a rate within the block.
 
-    Values may be late by ``held_ns`` until then: the kernel had them, and nobody can take them back from it.
+    The kernel's queue is full soon, and sending fails with ENOBUFS. When the bus is free again, the
+    kernel still sends the frames in its queue. Until then values may be late by ``held_ns``,
+    because frames in the kernel cannot be taken back.
     """
-    interface, watch = injection.bench.interface, injection.bench.watch
+    interface = injection.bench.interface
+    watch = injection.bench.watch
     watch.more_ns = held_ns
     run(f"tc qdisc add dev {interface} root tbf rate {rate} burst 160 limit 160")
     yield
     run(f"tc qdisc change dev {interface} root tbf rate {FREE} burst 160 limit 160")
     with RawBus(interface) as near:
-        # the limiter only looks at its queue when something comes
+        # The limiter checks its queue only when it gets a frame.
         near.send(0x7F0, wait=False)
     injection.cleared()
     injection.wait_recovery()
     watch.catch_up()
     watch.more_ns = 0
-    run(f"tc qdisc del dev {interface} root")  # what waits is thrown away: nothing does
+    run(f"tc qdisc del dev {interface} root")  # discards waiting frames, but the queue is empty
 
 
 @on_cable("ENOBUFS: a bus that takes less than there is to send", settle_s=1, rounds=[6])
 def no_buffers(bench: Bench, injection: Injection, seconds: float) -> None:
-    """The values that come are as fresh as ever, but for what the kernel holds of such a bus."""
+    """The values on the bus are fresh, except for frames that were in the kernel."""
     with slow_bus(injection, f"{SLOW_BITS_PER_S}bit", HELD_NS):
         time.sleep(seconds)
 
 
 @on_cable("a bus 100 % loaded by others", settle_s=1, rounds=[4])
 def loaded(bench: Bench, injection: Injection, seconds: float) -> None:
-    """No frame of ours gets through; the others' come in as fast as the machine makes them. What the controller holds then is late."""
+    """The gateway cannot send, while others send as fast as the machine can.
+
+    The frames in the controller are late then.
+    """
     before = bench.watch.by_more
     with slow_bus(injection, "8bit", 3600 * SECOND):
         words = f"cangen {bench.watched} -g 1 -I 010 -L 8 -D i".split()
@@ -135,7 +149,7 @@ def loaded(bench: Bench, injection: Injection, seconds: float) -> None:
 
 
 def near() -> Adapter:
-    """The gateway's."""
+    """Return the gateway's adapter."""
     return BUS[0].adapters[0]
 
 
@@ -152,10 +166,12 @@ def controller_bus_off(bench: Bench, injection: Injection, _n: int) -> None:
 @on_adapter("controller error passive", None, escs=[])
 def passive(bench: Bench, injection: Injection, _n: int) -> None:
     def wait_can_state(state: int) -> None:
-        """Wait until GatewayStatus says so."""
-        bench.wait_until(
-            lambda: bench.watch.value("GatewayStatus", "can_state") == state, 3, f"CanState {state}"
-        )
+        """Wait until GatewayStatus shows this state."""
+
+        def is_shown() -> bool:
+            return bench.watch.value("GatewayStatus", "can_state") == state
+
+        bench.wait_until(is_shown, 3, f"CanState {state}")
 
     near().tell_errors("f")
     near().tell_state("p", 10, 130)
@@ -186,7 +202,10 @@ def wrong_rate(bench: Bench, injection: Injection, _n: int) -> None:
 
 @on_adapter("an adapter that hangs", 1.0)
 def hanging(bench: Bench, injection: Injection, _n: int) -> None:
-    """What it had taken before it hung goes out late, as old as it is: that is inside the adapter. What the gateway sends is fresh."""
+    """Frames that the adapter had taken before it hung are sent late and old.
+
+    Later frames of the gateway are fresh.
+    """
     bench.watch.more_ns = 3 * SECOND
     near().stalled = True
     time.sleep(1.5)
@@ -212,20 +231,27 @@ def unplugged(bench: Bench, injection: Injection, _n: int) -> None:
 
 
 def cangen(bench: Bench, words: str) -> None:
-    """Frames from the far end, however full its queue is."""
+    """Send frames from the far end, even if its queue is full."""
     command = ["cangen", bench.watched, "-i", *words.split()]
     subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
 
 
 REQUESTS = [
-    *map(bytes.fromhex, ("4000100000000000", "4021100000000000", "2110100104000000")),
-    *map(bytes.fromhex, ("A02110007F000000", "6000000000000000", "8000000000000000")),
+    bytes.fromhex("4000100000000000"),
+    bytes.fromhex("4021100000000000"),
+    bytes.fromhex("2110100104000000"),
+    bytes.fromhex("A02110007F000000"),
+    bytes.fromhex("6000000000000000"),
+    bytes.fromhex("8000000000000000"),
 ]
 
 
 @traffic("SDO floods")
 def sdo_flood(bench: Bench, injection: Injection, n: int) -> None:
-    """Requests without waiting for an answer: right ones, wrong ones, beginnings of transfers that nobody goes on with."""
+    """Send requests without waiting for an answer.
+
+    Some are right, some are wrong, and some begin transfers that are never continued.
+    """
     generator = random.Random(7 + n)
     with RawBus(bench.watched) as vandal:
         end = time.monotonic() + 1.5
@@ -246,13 +272,19 @@ def sync(bench: Bench, injection: Injection, _n: int) -> None:
 
 
 def conflict(
-    bench: Bench, injection: Injection, n: int, frames: tuple[tuple[int, str], ...]
+    bench: Bench,
+    injection: Injection,
+    n: int,
+    frames: tuple[tuple[int, str], ...],
 ) -> None:
-    """Another node sends these frames, in turn as if it were node 1 and node 2: said once in the log, EMCY 8150h; ours go on."""
+    """Send these frames as if another node were node 1, and then node 2.
+
+    The log reports it once, the node sends EMCY 8150h, and our nodes continue.
+    """
     gateway = bench.gateway
     node = 1 + n
     if any("somebody else" in text and f"node {node}" in text for text in gateway.lines):
-        # the condition of before has to be over, or this is the same one
+        # The earlier conflict has to end first. Otherwise this is the same condition.
         begun = gateway.log.count("somebody else")
         bench.wait_until(lambda: gateway.log.count("nobody else") >= begun, 15, "it is over")
     lines = len(gateway.lines)
@@ -273,7 +305,7 @@ for name, frames in (
         "another node sends with our identifiers",
         ((0x687, "0000000000000000"), (0x180, "0000000000000000")),
     ),
-    # its boot-up, heartbeat and answers; our node stays as it is
+    # boot-up, heartbeat and answers of that node; our node keeps its state
     (
         "a second node with our node-ID",
         ((0x700, "00"), (0x700, "7F"), (0x580, "8000100000000405")),
@@ -282,10 +314,10 @@ for name, frames in (
     traffic(name)(partial(conflict, frames=frames))
 
 
-# last: our identifiers are among them, and who has somebody else there waits until he is gone
+# This is the last one: the frames include our identifiers, and a conflict has to end before others.
 @traffic("random frames", rounds=[1000])
 def random_frames(bench: Bench, injection: Injection, count: int) -> None:
-    """All identifiers, lengths and contents, remote and 29-bit frames among them."""
+    """Send all identifiers, lengths and contents, including remote and 29-bit frames."""
     for number, kind in ((8 * count, ""), (count, "-R"), (count, "-e")):
         cangen(bench, f"-g 0.3 -n {number} -I r -L r -D r {kind}")
     time.sleep(0.3)
@@ -307,7 +339,7 @@ NOISY, SILENT, UNPLUGGED = ILL = 0, 3, 6
     bed=eight,
 )
 def ill_among_well(bench: Bench, injection: Injection, n: int) -> None:
-    """The other five lose nothing, nor do the three what was whole."""
+    """The other five ESCs lose no value, and the three lose no value of a complete frame."""
     generator = random.Random(8 + n)
 
     def noise(wire: bytes) -> tuple[bytes, bool]:

@@ -1,4 +1,4 @@
-"""The faults there are, and what came of injecting them: a row for each, as docs/fault-programme.md shows them."""
+"""The list of faults, and the result of injecting each, as a row of docs/fault-programme.md."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -10,17 +10,20 @@ from xml.etree import ElementTree as ET
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of the programme. ``limit_s``: the longest recovery that is allowed; None: nothing may be disturbed at all."""
+    """A fault of the programme.
+
+    ``limit_s`` is the longest allowed recovery in s. None if no value may be disturbed.
+    """
 
     area: str
     name: str
     limit_s: float | None
     inject: Callable[[Any, Any, Any], None]
-    """One injection on a bench; the last argument is one of ``rounds``."""
+    """Injects the fault once on a bench. The last argument is one of ``rounds``."""
     bed: Callable[[Path], Any]
-    """Makes the bench that it needs; those with the same one share it."""
+    """Creates the bench of the fault. Faults with the same bed share the bench."""
     escs: Sequence[int] | None = None
-    """Those that it disturbs, None: all of the bench."""
+    """ESCs that the fault disturbs, or None for all ESCs of the bench."""
     settle_s: float = 0.5
     rounds: Sequence[Any] = range(2)
     machine: str = "UML"
@@ -30,24 +33,26 @@ class Fault:
 
 
 FAULTS: list[Fault] = []
-"""Every fault; filled by importing the modules that define them."""
+"""Every fault. Importing the modules that define faults fills the list."""
 AREAS = ("Start", "Serial", "CAN", "Time", "Process", "Disk", "Traffic", "Many")
-GOOD, FAILED = "good", "failed"
+GOOD = "good"
+FAILED = "failed"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "fault-programme.md"
-BEGIN, END = "<!-- faults begin -->\n", "<!-- faults end -->\n"
+BEGIN = "<!-- faults begin -->\n"
+END = "<!-- faults end -->\n"
 HEAD = f"""| machine, fault | injected | recovered | worst recovery | wrong values | values lost | state |
 {"|---" * 7}|
 """
 
 
 def in_order() -> list[Fault]:
-    """The faults in the order of the table."""
+    """Return the faults in the order of the table."""
     return sorted(FAULTS, key=lambda fault: (fault.machine != "UML", AREAS.index(fault.area)))
 
 
 @dataclass
 class Row:
-    """What came of one fault."""
+    """The result of one fault."""
 
     fault: str
     limit_s: float | None
@@ -59,23 +64,24 @@ class Row:
     transmitted: int = 0
     """Bytes that the gateway sent to an ESC."""
     notes: list[str] = field(default_factory=list)
-    """What went wrong, for people."""
+    """Descriptions of the problems, for people."""
 
     @property
     def state(self) -> str:
-        healed = self.injected > 0 and self.recovered == self.injected
-        return FAILED if not healed or self.wrong or self.lost or self.transmitted else GOOD
+        has_recovered = self.injected > 0 and self.recovered == self.injected
+        is_bad = not has_recovered or self.wrong or self.lost or self.transmitted
+        return FAILED if is_bad else GOOD
 
     def __str__(self) -> str:
-        """A line of the page."""
+        """Return the line of the page."""
         limit = self.limit_s
         recovery = "undisturbed" if limit is None else f"{self.worst_s:.2f} s (limit {limit:g} s)"
         counts = (self.injected, self.recovered, recovery, self.wrong, self.lost, self.state)
         return f"| {self.fault} | {' | '.join(map(str, counts))} |"
 
     @property
-    def told(self) -> str:
-        """For the terminal: the line, and below it what went wrong."""
+    def text(self) -> str:
+        """Return the line for the terminal, and below it the problems."""
         notes = list(self.notes[:8])
         if self.transmitted:
             notes.append(f"{self.transmitted} bytes sent to an ESC")
@@ -83,38 +89,39 @@ class Row:
 
 
 class Report(dict[str, Row]):
-    """The rows of a run by the names of the faults."""
+    """The rows of a run by name of the fault."""
 
     def of(self, fault: Fault) -> Row:
-        """The row of a fault, made when it is first asked for."""
+        """Return the row of a fault, which is created at the first call."""
         return self.setdefault(str(fault), Row(str(fault), fault.limit_s))
 
     def write(self, path: Path) -> None:
         path.write_text(json.dumps([asdict(row) for row in self.values()], indent=1) + "\n")
 
     def read(self, path: Path) -> None:
-        """Take in what another run has written."""
+        """Read the rows that another run has written."""
         self.update((found["fault"], Row(**found)) for found in json.loads(path.read_text()))
 
     def write_junit(self, path: Path) -> None:
-        """Each row as a test."""
+        """Write a JUnit report with each row as a test."""
         suite = ET.Element("testsuite")
         for row in self.values():
             case = ET.SubElement(suite, "testcase", classname="faults", name=row.fault)
             if row.state == FAILED:
-                ET.SubElement(case, "failure", message=row.told)
+                ET.SubElement(case, "failure", message=row.text)
         ET.ElementTree(suite).write(path)
 
 
 def shown(text: str) -> dict[str, str]:
-    """The lines of a page by their fault."""
+    """Return the lines of a page by name of the fault."""
     lines = text.partition(BEGIN)[2].partition(END)[0].splitlines()[2:]
     return {line.split(" | ")[0].removeprefix("| "): line for line in lines}
 
 
 def put(text: str, report: Report) -> str:
-    """A page with the rows of a report in the place of older ones, in the order of the programme."""
+    """Return a page on which a report's rows replace older ones, in the programme's order."""
     rows = shown(text) | {row.fault: str(row) for row in report.values()}
     listed = [f"{rows[str(each)]}\n" for each in in_order() if str(each) in rows]
-    before, after = text.partition(BEGIN)[0], text.partition(END)[2]
+    before = text.partition(BEGIN)[0]
+    after = text.partition(END)[2]
     return "".join((before, BEGIN, HEAD, *listed, END, after))

@@ -1,10 +1,12 @@
-"""ESCs that are played into whatever takes bytes, in real time: when each frame was sent, and whether it was sent whole, is kept.
+"""Simulated ESCs that send frames in real time, and record each frame's time and completeness.
 
-Their telemetry betrays itself: every field of frame n follows from n and the ESC by a fixed mixing function. So whoever sees a value
-knows which frames may have carried it, and a value that is wrong, old or put together from two frames is recognised. All values are
-inside the sheet's ranges and differ from the DBC's codes for "not available" and "error".
+Every field of frame n is computed from n and the ESC by a fixed mixing function. A value on the bus
+therefore shows which frames may have carried it. Values that are wrong, old or combined from two
+frames are recognised. All values are inside the sheet's ranges and differ from the DBC's codes for
+"not available" and "error".
 
-What may touch what: the feeder's thread writes the records; everybody may read them and set ``on``, ``write``, ``mangle``, ``rate_hz``.
+The feeder's thread writes the records. Other threads may read them, and may set ``on``, ``write``,
+``mangle`` and ``rate_hz``.
 """
 
 import contextlib
@@ -27,28 +29,29 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and
 from kontronik_can_gw.esc.kontronik.states import Device
 
 SECOND = 1_000_000_000
-SPEED, CURRENT = 1, 2
-"""Bits of ``seen``: the messages that follow each live frame."""
+SPEED = 1
+CURRENT = 2
+"""Bits of ``seen``: the messages that are sent after each live frame."""
 _MASK = 0xFFFFFFFF
 POLE_PAIRS = 7
 GEAR = 9.8
 PROGRAMMING_ALLOWED = 1 << 17
-"""Set in every recorded idle frame, and no alarm."""
+"""A bit that is set in every recorded idle frame. It is not an alarm."""
 
 
 class Identity(NamedTuple):
-    """Who is on the line: another ESC has another ``salt``, so that its values are different ones."""
+    """The ESC on a line. Each ESC has a different ``salt``, so its values differ."""
 
     salt: int = 1
     layout: Layout = Layout.V4
     device: Device = Device.KOSMIK
     cells: int = 6
     alarms: bool = False
-    """Let alarm bits come and go, a change each 128 frames."""
+    """Set and clear alarm bits. They change every 128 frames."""
 
 
 def mix(n: int, salt: int) -> int:
-    """32 bits that depend on all bits of both."""
+    """Return 32 bits that depend on all bits of both arguments."""
     x = (n * 0x9E3779B1 + salt * 0x85EBCA77 + 0x7F4A7C15) & _MASK
     x = ((x ^ x >> 16) * 0x21F0AAAD) & _MASK
     x = ((x ^ x >> 15) * 0x735A2D97) & _MASK
@@ -56,7 +59,7 @@ def mix(n: int, salt: int) -> int:
 
 
 def live(identity: Identity, n: int) -> LiveData:
-    """The live frame number n of an ESC."""
+    """Return live frame n of an ESC."""
     a, b, c, d = (mix(n, identity.salt * 8 + i) for i in range(4))
     errors = PROGRAMMING_ALLOWED
     if identity.alarms and n >> 7 & 1:
@@ -82,7 +85,7 @@ def live(identity: Identity, n: int) -> LiveData:
 
 
 def info(identity: Identity, m: int) -> InfoData:
-    """The info frame number m of an ESC."""
+    """Return info frame m of an ESC."""
     a, b, c = (mix(m, identity.salt * 8 + 4 + i) for i in range(3))
     return InfoData(
         device_and_variant=device_and_variant(identity.device, 100 + identity.salt % 900),
@@ -112,10 +115,14 @@ def physical(data: Any, fields: Sequence[sheet.Field]) -> dict[str, float]:
 
 @lru_cache(1024)
 def live_values(identity: Identity, n: int) -> dict[str, float]:
-    """Physical values of a live frame by the names that the DBC's signals have in snake case, and its error bits as "flags"."""
+    """Return the physical values of a live frame, and its error bits as "flags".
+
+    The names are the DBC's signal names in snake case.
+    """
     data = live(identity, n)
     values = physical(data, sheet.LIVE_FIELDS)
-    speed, voltage = values["electrical_speed"], values["battery_voltage"]
+    speed = values["electrical_speed"]
+    voltage = values["battery_voltage"]
     return {
         **values,
         "flags": data.operating_errors & 0xFFFFFF,
@@ -129,7 +136,7 @@ def live_values(identity: Identity, n: int) -> dict[str, float]:
 
 @lru_cache(1024)
 def info_values(identity: Identity, m: int) -> dict[str, float]:
-    """The same of an info frame."""
+    """Return the physical values of an info frame, and its self-test errors as "flags"."""
     data = info(identity, m)
     return {
         **physical(data, sheet.INFO_FIELDS),
@@ -143,41 +150,50 @@ def info_values(identity: Identity, m: int) -> dict[str, float]:
 
 
 class FedEsc:
-    """One ESC: who it is, what it has sent; where its bytes go is the matter of those that are made of it.
+    """One ESC: its identity and the frames that it has sent. Subclasses send the bytes.
 
-    ``mangle`` gets the bytes of a frame and returns what goes on the line and whether the frame is still whole in it. ``rate_hz``
-    frames a second, every ``info_every``-th of them an info frame.
+    ``mangle`` gets the bytes of a frame. It returns the bytes to send, and whether they contain the
+    complete frame. The ESC sends ``rate_hz`` frames a second. Every ``info_every``-th frame is an
+    info frame.
     """
 
     path: str
-    """What the gateway opens."""
+    """The path that the gateway opens."""
 
-    def __init__(self, identity: Identity, rate_hz: float = 50, info_every: int = 100) -> None:
+    def __init__(
+        self,
+        identity: Identity,
+        rate_hz: float = 50,
+        info_every: int = 100,
+    ) -> None:
         self.rate_hz = rate_hz
         self.info_every = info_every
         self.on = True
         self.mangle: Callable[[bytes], tuple[bytes, bool]] | None = None
         self.sent = array("q")
-        """Monotonic nanoseconds at which live frame n was handed over."""
+        """Monotonic nanoseconds at which live frame n was sent."""
         self.whole = bytearray()
-        """1 where live frame n left whole."""
+        """1 if live frame n was sent completely."""
         self.seen = bytearray()
-        """Which messages with live frame n came to the bus; written by the bus watch."""
+        """Messages with live frame n that were seen on the bus. The bus watch writes it."""
         self.info_sent = array("q")
         self.identity = identity
-        """Who is on the line; another one from the next frame on where it is set."""
+        """The ESC on the line. If it is set, the next frame is the new ESC's."""
         self._was: list[Identity] = []
-        """Who sent live frame n."""
+        """The ESC that sent live frame n."""
         self._was_of_info: list[Identity] = []
         self._ticks = 0
         self.due_ns = 0
 
     def write(self, data: bytes) -> bool:
-        """Bytes to the line; False where not all were taken."""
+        """Send bytes on the line. Return False if not all were taken."""
         raise NotImplementedError
 
     def received(self) -> int:
-        """Bytes that came to the ESC so far but for the kernel's echo between a plug-in and the gateway's setting of the port."""
+        """Return the number of bytes that the ESC has received.
+
+        The kernel's echo between plugging in and the gateway's setting of the port is not counted.
+        """
         raise NotImplementedError
 
     def close(self) -> None:
@@ -187,14 +203,14 @@ class FedEsc:
         return live(self._was[n], n)
 
     def values(self, n: int) -> dict[str, float]:
-        """What live frame n means."""
+        """Return the physical values of live frame n."""
         return live_values(self._was[n], n)
 
     def values_of_info(self, m: int) -> dict[str, float]:
         return info_values(self._was_of_info[m], m)
 
     def newest(self, at_ns: int) -> int:
-        """The number of the newest live frame sent until then, -1 if there is none."""
+        """Return the number of the newest live frame sent until this time, or -1."""
         return bisect_right(self.sent, at_ns) - 1
 
     def newest_info(self, at_ns: int) -> int:
@@ -203,10 +219,15 @@ class FedEsc:
     def send_one(self) -> None:
         """Send the next frame now."""
         self._ticks += 1
-        is_info = self._ticks % self.info_every == 3  # the first one soon
+        is_info = self._ticks % self.info_every == 3  # the first one is sent soon
         identity = self.identity
-        data = info(identity, len(self.info_sent)) if is_info else live(identity, len(self.sent))
-        wire, whole = encode(data, identity.layout), True
+        data: InfoData | LiveData
+        if is_info:
+            data = info(identity, len(self.info_sent))
+        else:
+            data = live(identity, len(self.sent))
+        wire = encode(data, identity.layout)
+        whole = True
         if self.mangle is not None:
             wire, whole = self.mangle(wire)
         self.note(time.monotonic_ns(), is_info)
@@ -215,7 +236,10 @@ class FedEsc:
             self.whole[-1] = taken and whole
 
     def note(self, at_ns: int, is_info: bool = False) -> None:
-        """A frame is sent at that time; ``sent`` last, for whoever finds a frame there looks at the rest."""
+        """Record that a frame is sent at this time.
+
+        ``sent`` is written last, because a reader that finds a frame there reads the other lists.
+        """
         if is_info:
             self._was_of_info.append(self.identity)
             self.info_sent.append(at_ns)
@@ -227,7 +251,10 @@ class FedEsc:
 
 
 class Feeder:
-    """The thread that sends. Frames are never sent closer than 0.8 of their distance: nothing is made up for."""
+    """The thread that sends the frames.
+
+    The distance of frames is at least 0.8 periods, so delayed frames are not sent in a burst.
+    """
 
     def __init__(self, escs: Sequence[FedEsc]) -> None:
         self.escs = list(escs)
@@ -237,8 +264,9 @@ class Feeder:
 
     def start(self) -> Self:
         now = time.monotonic_ns()
-        for i, esc in enumerate(self.escs):
-            esc.due_ns = now + int(SECOND / esc.rate_hz * i / len(self.escs))
+        for number, esc in enumerate(self.escs):
+            period = SECOND / esc.rate_hz
+            esc.due_ns = now + int(period * number / len(self.escs))
         self._thread.start()
         return self
 
@@ -253,10 +281,14 @@ class Feeder:
                     if esc.on:
                         with contextlib.suppress(OSError):
                             esc.send_one()
-                    esc.due_ns = max(esc.due_ns + period, time.monotonic_ns() + period * 8 // 10)
-                pause = (min(esc.due_ns for esc in self.escs) - time.monotonic_ns()) / SECOND
-                if pause > 0:
-                    self._stop.wait(pause) if pause > 0.05 else time.sleep(pause)
+                    earliest = time.monotonic_ns() + period * 8 // 10
+                    esc.due_ns = max(esc.due_ns + period, earliest)
+                next_due = min(esc.due_ns for esc in self.escs)
+                pause = (next_due - time.monotonic_ns()) / SECOND
+                if pause > 0.05:
+                    self._stop.wait(pause)
+                elif pause > 0:
+                    time.sleep(pause)
         except BaseException as error:
             self.error = error
             raise

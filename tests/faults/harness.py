@@ -1,12 +1,16 @@
-"""The bench of the fault programme: fed ESCs, a gateway process, a judge of the bus, and the account of each injected fault.
+"""The bench of the fault programme: fed ESCs, a gateway process, a judge, and each fault's result.
 
-    @fault("Serial", "port gone and back", 2.0, escs=[0])    # who is disturbed by it; []: nobody may be; all unless given
-    def gone(bench, injection, pause):                       # one of the fault's rounds
+    @fault("Serial", "port gone and back", 2.0, escs=[0])
+    def gone(bench, injection, pause):
         ...the fault is on...
-        injection.cleared()                                  # its cause is gone: until the first right value sent since then
+        injection.cleared()
 
-Then the bus is watched a while longer, then wrong and lost values are put down to the fault. Times are
-monotonic nanoseconds, of frames the kernel's.
+``escs`` are the ESCs that the fault may disturb, by default all of them. With ``[]`` no ESC may be
+disturbed. The last argument is one of the fault's rounds. ``cleared`` means that the cause is gone.
+The recovery lasts from then to the first right value that was sent after it.
+
+The bus is watched a while longer, and wrong and lost values are counted for the fault. Times are
+monotonic nanoseconds. Times of frames are the kernel's.
 """
 
 import os
@@ -28,17 +32,20 @@ from signals import Table
 from kontronik_can_gw.desk.pty import PtyEsc
 
 IN_FLIGHT_NS = 60 * MS
-"""A frame that was handed over so shortly before a fault may be its victim."""
+"""A frame that was sent within this time before a fault may be lost because of it."""
 AHEAD = ("chrt", "-f", "10")
-"""The gateway goes before the bench's own processes, with which it shares a processor here."""
+"""Gives the gateway priority over the bench's own processes, which share its processor."""
 
 
 class NotRecovered(AssertionError):
-    """The gateway did not come back in time."""
+    """The gateway did not recover in time."""
 
 
 class LoggedProcess:
-    """A program as its own process, and the lines that it has written so far: ``lines`` to standard error, ``out`` to standard output."""
+    """A program in a separate process, and the lines that it has written so far.
+
+    ``lines`` has the lines of standard error, ``out`` the lines of standard output.
+    """
 
     def __init__(
         self,
@@ -73,29 +80,34 @@ class LoggedProcess:
         return "\n".join(self.lines)
 
     def wait(self) -> int:
-        """Wait until it has ended and all that it wrote is read; its exit code."""
+        """Wait until it has ended and its output is read. Return its exit code."""
         code = self.process.wait(60)
         for reader in self._readers:
             reader.join(60)
         return code
 
     def kill(self) -> None:
-        """End it, however it fares."""
+        """Kill it unless it has ended."""
         if self.process.poll() is None:
             self.process.kill()
         self.wait()
 
 
 class Gateway(LoggedProcess):
-    """``kontronik-can-gw run`` with a prefix (``setpriv``) and an environment if need be."""
+    """``kontronik-can-gw run`` with an optional prefix such as ``setpriv``, and an environment."""
 
-    def __init__(self, config: Path, prefix: Sequence[str], environment: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        config: Path,
+        prefix: Sequence[str],
+        environment: Mapping[str, str],
+    ) -> None:
         program = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(config), "--wait"]
         self.started_ns = time.monotonic_ns()
         super().__init__([*AHEAD, *prefix, *program], environment)
 
     def figures(self) -> dict[str, int]:
-        """Resident memory in KiB, open descriptors, threads."""
+        """Return its resident memory in KiB and its numbers of open descriptors and threads."""
         folder = Path("/proc", str(self.process.pid))
         status = dict(row.split(":", 1) for row in (folder / "status").read_text().splitlines())
         return {
@@ -104,18 +116,26 @@ class Gateway(LoggedProcess):
             "threads": int(status["Threads"]),
         }
 
-    def growth(self, before: dict[str, int], rss_kib: int) -> list[str]:
-        """What it has more of than before, memory above so much."""
-        limits, after = before | {"rss": before["rss"] + rss_kib}, self.figures()
-        return [
-            f"{each} {before[each]} -> {after[each]}"
-            for each in before
-            if after[each] > limits[each]
-        ]
+    def growth(
+        self,
+        before: dict[str, int],
+        rss_kib: int,
+    ) -> list[str]:
+        """Return the figures that have grown, as text. Memory may grow by ``rss_kib``."""
+        limits = before | {"rss": before["rss"] + rss_kib}
+        after = self.figures()
+        grown = []
+        for each in before:
+            if after[each] > limits[each]:
+                grown.append(f"{each} {before[each]} -> {after[each]}")
+        return grown
 
 
 class PtyPort(FedEsc):
-    """A fed ESC on a pseudo terminal, which is made without echo, behind a symbolic link; it may be unplugged and plugged in again."""
+    """A fed ESC on a pseudo terminal without echo, behind a symbolic link.
+
+    It may be unplugged and plugged in again.
+    """
 
     def __init__(self, link: Path, identity: Identity, rate_hz: float = 50) -> None:
         super().__init__(identity, rate_hz)
@@ -137,7 +157,7 @@ class PtyPort(FedEsc):
             return self._pty is not None and self._pty.write(data)
 
     def unplug(self) -> None:
-        """The terminal hangs up, the link goes."""
+        """Hang up the terminal and remove the link."""
         with self._lock:
             if self._pty is not None:
                 self._received += self._pty.check()
@@ -145,7 +165,7 @@ class PtyPort(FedEsc):
                 self._pty = None
 
     def plug(self, other: bool = False) -> None:
-        """A new terminal behind the same link; ``other``: certainly under another number than the one before."""
+        """Create a terminal behind the same link. With ``other`` it has another number."""
         before = PtyEsc() if other else None
         with self._lock:
             assert self._pty is None
@@ -164,14 +184,14 @@ class PtyPort(FedEsc):
 
 
 class Bench:
-    """Everything that runs around one gateway.
+    """One gateway and everything that runs around it.
 
-    ``interface`` is the gateway's, ``watched`` the far end of it, where the judge listens. ``canopen``: with a node for each ESC.
-    ``more``: further tables of the configuration.
+    ``interface`` is the gateway's interface. The judge receives at ``watched``, its far end.
+    With ``canopen`` there is a node for each ESC. ``more`` has further tables of the configuration.
     """
 
     said_instead: str | None = None
-    """What the log may say in place of a line that is waited for."""
+    """Text that the log may have in place of an expected line."""
 
     def __init__(
         self,
@@ -208,20 +228,25 @@ class Bench:
         if canopen:
             text += "[canopen]\nenabled = true\nself_start = true\nnode_id = 1\nserial = 1050112\n"
             text += f'store = "{self.store}"\n'
-        for i, esc in enumerate(self.escs):
-            text += f'[[esc]]\nname = "esc{i + 1}"\nport = "{esc.path}"\npole_pairs = {POLE_PAIRS}\ngear = {GEAR}\n'
+        for number, esc in enumerate(self.escs, 1):
+            text += f'[[esc]]\nname = "esc{number}"\nport = "{esc.path}"\n'
+            text += f"pole_pairs = {POLE_PAIRS}\ngear = {GEAR}\n"
         return text
 
     # --- the gateway
 
     @property
     def gateway(self) -> Gateway:
-        """The one that runs."""
+        """The running gateway."""
         assert self._gateway is not None
         return self._gateway
 
     def start(self, *, wait: bool = True) -> None:
-        """Start the gateway; ``wait``: until every ESC that is on has its values on the bus. NotRecovered if they do not come."""
+        """Start the gateway.
+
+        With ``wait``, wait until the values of every ESC that is on are on the bus. Raise
+        NotRecovered if they do not arrive within 20 s.
+        """
         assert self._gateway is None
         begin = time.monotonic_ns()
         self._gateway = Gateway(self.config, self.prefix, self.environment)
@@ -231,7 +256,7 @@ class Bench:
             self.leave_out(range(len(self.escs)), begin - IN_FLIGHT_NS, time.monotonic_ns())
 
     def stop(self) -> int:
-        """End the gateway by SIGTERM; its exit code."""
+        """End the gateway by SIGTERM. Return its exit code."""
         process = self.gateway.process
         try:
             process.terminate()
@@ -242,15 +267,23 @@ class Bench:
             self.kill()
 
     def kill(self) -> None:
-        """End the gateway, however it fares."""
-        gateway, self._gateway = self._gateway, None
+        """Kill the gateway unless it has ended."""
+        gateway = self._gateway
+        self._gateway = None
         if gateway is not None:
             gateway.kill()
 
     def wait_fresh(
-        self, escs: Sequence[int], after_ns: int, seconds: float, sent_after_ns: int = 0
+        self,
+        escs: Sequence[int],
+        after_ns: int,
+        seconds: float,
+        sent_after_ns: int = 0,
     ) -> int:
-        """Wait until each of these ESCs has had a right value on the bus after a time; when the last of them came first."""
+        """Wait until each of these ESCs has had a right value on the bus after a time.
+
+        Return the time at which the last ESC's first right value arrived.
+        """
         came = [after_ns]
 
         def all_came() -> bool:
@@ -262,30 +295,43 @@ class Bench:
         self.wait_until(all_came, seconds, f"right values of {names}")
         return max(came)
 
-    def wait_until(self, condition: Callable[[], object], seconds: float, what: str) -> None:
-        """Wait until something holds. NotRecovered when it does not come."""
-        begin, last = time.monotonic(), False
+    def wait_until(
+        self,
+        condition: Callable[[], object],
+        seconds: float,
+        what: str,
+    ) -> None:
+        """Wait until a condition is true. Raise NotRecovered if it stays false."""
+        begin = time.monotonic()
+        last = False
         while not condition():
             if last:
                 raise NotRecovered(f"{what}: not within {seconds:g} s; {self.last_words()}")
             self.check_alive()
             if time.monotonic() - begin > seconds:
-                self.watch.catch_up()  # and look once more
+                self.watch.catch_up()  # and check a last time
                 last = True
             else:
                 time.sleep(0.01)
 
-    def wait_log(self, text: str, since: int = 0, seconds: float = 10) -> None:
-        """Wait for a line with this text in the gateway's log, from that line on."""
-        lines, texts = self.gateway.lines, [each for each in (text, self.said_instead) if each]
-        self.wait_until(
-            lambda: any(each in line for line in lines[since:] for each in texts),
-            seconds,
-            f"the log says {text!r}",
-        )
+    def wait_log(
+        self,
+        text: str,
+        since: int = 0,
+        seconds: float = 10,
+    ) -> None:
+        """Wait for a line with this text in the gateway's log, beginning at line ``since``."""
+        lines = self.gateway.lines
+        texts = [each for each in (text, self.said_instead) if each]
+
+        def is_logged() -> bool:
+            log = "\n".join(lines[since:])
+            return any(each in log for each in texts)
+
+        self.wait_until(is_logged, seconds, f"the log says {text!r}")
 
     def expect(self, holds: object, what: str) -> None:
-        """NotRecovered unless something holds."""
+        """Raise NotRecovered unless the condition is true."""
         if not holds:
             raise NotRecovered(f"{what}; {self.last_words()}")
 
@@ -303,13 +349,21 @@ class Bench:
 
     # --- accounts
 
-    def leave_out(self, escs: Sequence[int] | range, begin_ns: int, end_ns: int) -> None:
-        """What these ESCs sent in that time need not come to the bus."""
+    def leave_out(
+        self,
+        escs: Sequence[int] | range,
+        begin_ns: int,
+        end_ns: int,
+    ) -> None:
+        """Do not expect frames on the bus that these ESCs sent in this time."""
         for esc in escs:
             self._excluded[esc].append((begin_ns, end_ns))
 
     def account(self, row: Row) -> list[tuple[int, str]]:
-        """Note in a row how many values that were sent since the last account, outside of all faults, never came; when and which."""
+        """Count in a row the values that were lost outside of all faults since the last account.
+
+        Return the time and a description of each.
+        """
         until_ns = time.monotonic_ns() - 150 * MS
         self.watch.catch_up()
         losses = []
@@ -329,11 +383,11 @@ class Bench:
         return losses
 
     def inject(self, fault: Fault, row: Row, given: Any) -> bool:
-        """One injection of a fault, noted in the row; True if the bench is still good."""
+        """Inject a fault once, and note the result. Return True if the bench is still usable."""
         row.injected += 1
         try:
             self.check_alive()
-            self.account(row)  # of before; nobody's fault is the programme's too
+            self.account(row)  # losses before the injection count as well
         except NotRecovered as error:
             row.notes.append(str(error))
             return False
@@ -355,7 +409,8 @@ class Bench:
         if not good:
             injection.leave_out_until(time.monotonic_ns())
         injection.note_values(self.account(row))
-        received, self._received = self._received, sum(esc.received() for esc in self.escs)
+        received = self._received
+        self._received = sum(esc.received() for esc in self.escs)
         row.transmitted += max(0, self._received - received)
         if fault.limit_s is not None and injection.recovery_s > fault.limit_s:
             row.notes.append(f"recovered only after {injection.recovery_s:.2f} s")
@@ -365,7 +420,7 @@ class Bench:
         return good
 
     def close(self) -> None:
-        """End the gateway and everything else; the folder stays for a look at it as long as the machine lives."""
+        """End the gateway and everything else. The folder is kept for inspection."""
         self.feeder.close()
         self.kill()
         self.watch.close()
@@ -380,7 +435,7 @@ class Bench:
 
 
 class Injection:
-    """One fault while it is on and until it is healed."""
+    """One injected fault until the gateway has recovered from it."""
 
     def __init__(self, bench: Bench, fault: Fault, row: Row) -> None:
         self.bench = bench
@@ -396,20 +451,23 @@ class Injection:
         self._wrong = bench.watch.wrong_count
 
     def cleared(self) -> None:
-        """The cause is gone; what is sent from now on has to arrive soon."""
+        """Note that the cause is gone. Frames that are sent later have to arrive soon."""
         self.cleared_ns = time.monotonic_ns()
 
     def wait_recovery(self) -> None:
-        """Wait for the first right value of each disturbed ESC that was sent since ``cleared``."""
+        """Wait for a right value of each disturbed ESC that was sent after ``cleared``."""
         assert self.cleared_ns is not None
         limit_s = (self.fault.limit_s or 1.0) * 3 + 2
         self.recovered_ns = self.bench.wait_fresh(
-            self.escs, self.cleared_ns, limit_s, self.cleared_ns
+            self.escs,
+            self.cleared_ns,
+            limit_s,
+            self.cleared_ns,
         )
         self.healed_at(self.recovered_ns)
 
     def healed_at(self, at_ns: int) -> None:
-        """Something else that had to heal too was good at that time."""
+        """Note that something else that had to recover was good at this time."""
         assert self.cleared_ns is not None
         self.recovery_s = max(self.recovery_s, (at_ns - self.cleared_ns) / SECOND)
 
@@ -435,19 +493,23 @@ class Injection:
         self.bench.wait_until(seen, 3, f"EMCY {code:X}h")
 
     def leave_out_until(self, end_ns: int) -> None:
-        """What was sent until then may be lost."""
+        """Allow frames that were sent until this time to be lost."""
         self.bench.leave_out(self.escs, self.begin_ns - IN_FLIGHT_NS, end_ns)
 
     def note_values(self, losses: Sequence[tuple[int, str]]) -> None:
-        """Put the wrong values since the injection, and these lost ones, down to it."""
+        """Count the wrong values since the injection, and these lost ones, for this fault."""
 
         def after(at_ns: int | None) -> str:
-            return "no time" if at_ns is None else f"{(at_ns - self.begin_ns) / SECOND:.3f} s"
+            if at_ns is None:
+                return "no time"
+            return f"{(at_ns - self.begin_ns) / SECOND:.3f} s"
 
-        watch, row = self.bench.watch, self.row
+        watch = self.bench.watch
+        row = self.row
         wrong = watch.wrong_count - self._wrong
         row.wrong += wrong
-        for each in list(watch.wrong)[-min(wrong, 3) :] if wrong else ():
+        shown = list(watch.wrong)[-min(wrong, 3) :] if wrong else []
+        for each in shown:
             row.notes.append(f"wrong value {after(each.at_ns)} after the injection: {each.what}")
         if losses:
             when = "; ".join(f"{after(at)} {what}" for at, what in losses[:4])

@@ -1,15 +1,18 @@
-"""Judges resident memory by its slope over time, because a limit of its growth misses what grows slowly."""
+"""Judges resident memory by its slope over time, because a limit misses slow growth."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 HOUR_S = 3600
 MAX_KIB_PER_HOUR = 128
-"""Four hours may add 0.5 MB. The free lists that grew with recording, CANopen and DroneCAN added 3.3 MB in a quarter of an hour."""
+"""Four hours may add 0.5 MB.
+
+The free lists that grew with recording, CANopen and DroneCAN added 3.3 MB in a quarter of an hour.
+"""
 MIN_HOURS = 1
-"""A shorter run tells nothing: memory is given back in pages, and faults take some for a while."""
+"""Shortest run that is judged: memory is freed in pages, and faults use some for a while."""
 _WARM_UP = 0.25
-"""Part of the run that does not count: caches and buffers reach their sizes."""
+"""Part of the run that is ignored: caches and buffers reach their sizes."""
 
 
 class Sample(NamedTuple):
@@ -20,7 +23,7 @@ class Sample(NamedTuple):
 
 
 def slope_kib_per_hour(samples: Sequence[Sample]) -> float:
-    """The slope of the straight line that fits best (least squares); 0 for less than two samples."""
+    """Return the slope of the regression line (least squares), or 0 for less than two samples."""
     count = len(samples)
     if count < 2:
         return 0.0
@@ -32,10 +35,14 @@ def slope_kib_per_hour(samples: Sequence[Sample]) -> float:
 
 
 def faults_in(samples: Sequence[Sample]) -> list[str]:
-    """What is wrong with the memory of a run, in words; empty for a run that is shorter than ``MIN_HOURS``."""
+    """Return the faults of a run's memory as text.
+
+    The list is empty for a run that is shorter than ``MIN_HOURS``.
+    """
     if not samples:
         return []
-    begin, end = samples[0].seconds, samples[-1].seconds
+    begin = samples[0].seconds
+    end = samples[-1].seconds
     if end - begin < MIN_HOURS * HOUR_S:
         return []
     settled = [each for each in samples if each.seconds >= begin + _WARM_UP * (end - begin)]

@@ -1,4 +1,7 @@
-"""Faults of the process: killed, ended, started twice, hung, suspended; of its clock; and of the disk that the nodes' parameters are on."""
+"""Faults of the process, of its clock, and of the disk that has the nodes' parameters.
+
+The process is killed, ended, started twice, frozen or suspended.
+"""
 
 import contextlib
 import os
@@ -20,10 +23,10 @@ from harness import Bench, Injection, PtyPort
 from raw_bus import RawBus
 
 RESTART_LIMIT_S = 3.0
-"""With the start of Python. That a gateway is back within a second is held by tests/runtime/test_life_of_the_process.py."""
+"""Longest recovery in s, including the start of Python."""
 STOPPING = 2
 TIMEOUT_OBJECT = 0x2100, 4
-"""Telemetry time-out in ms, which a master may set and store."""
+"""Index and subindex of the telemetry time-out in ms, which a master may set and store."""
 process = partial(fault, "Process", limit_s=RESTART_LIMIT_S)
 
 
@@ -36,7 +39,10 @@ def start_and_wait(injection: Injection) -> None:
 
 @process("kill -9 at any instant, and restart", rounds=range(3))
 def killed(bench: Bench, injection: Injection, n: int) -> None:
-    """Also while it stores parameters: afterwards they are those before or those after, never anything else."""
+    """Kill the gateway, also while it stores parameters.
+
+    After that the stored parameters are the old or the new ones, never anything else.
+    """
     generator = random.Random(6 + n)
     with RawBus(bench.watched) as master:
         value = 200 + generator.randrange(90)
@@ -60,7 +66,7 @@ def killed(bench: Bench, injection: Injection, n: int) -> None:
 
 @process("SIGTERM, and restart")
 def ended(bench: Bench, injection: Injection, _n: int) -> None:
-    """Ends within 0.5 s, and its last status says so."""
+    """Check that it ends within 0.5 s, and that its last status reports it."""
     begin = time.monotonic_ns()
     code = bench.stop()
     took = (time.monotonic_ns() - begin) / SECOND
@@ -72,13 +78,18 @@ def ended(bench: Bench, injection: Injection, _n: int) -> None:
     start_and_wait(injection)
 
 
-SAME_PORT, SAME_NODES = "is in use by another program", "another gateway on this machine"
+SAME_PORT = "is in use by another program"
+SAME_NODES = "another gateway on this machine"
 
 
 @fault("Process", "a second instance", None, escs=[], rounds=(SAME_PORT, SAME_NODES))
 def second(bench: Bench, injection: Injection, reason: str) -> None:
-    """On the same port, and with the same nodes on the same interface: refused with one line, the first goes on undisturbed."""
-    other, extra = bench.folder / "second.toml", bench.folder / "second"
+    """Start a second gateway on the same port, or with the same nodes on the same interface.
+
+    It is refused with one line, and the first gateway is not disturbed.
+    """
+    other = bench.folder / "second.toml"
+    extra = bench.folder / "second"
     text = bench.config.read_text()
     if reason == SAME_PORT:
         text = text.replace("enabled = true", "enabled = false")
@@ -89,18 +100,25 @@ def second(bench: Bench, injection: Injection, reason: str) -> None:
     port = PtyPort(extra, bench.escs[0].identity)
     try:
         command = [sys.executable, "-m", "kontronik_can_gw", "run", "-c", str(other)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=30,
+            check=False,
+        )
     finally:
         port.close()
-    said = done.stderr.strip()
+    errors = done.stderr.strip()
+    is_one_line = len(errors.splitlines()) == 1
     bench.expect(
-        done.returncode == 1 and len(said.splitlines()) == 1 and reason in said,
-        f"it ended with {done.returncode}, not by {reason!r} in one line: {said}",
+        done.returncode == 1 and is_one_line and reason in errors,
+        f"it ended with {done.returncode}, not by {reason!r} in one line: {errors}",
     )
 
 
 class Supervisor:
-    """A stand-in for systemd: takes the notifications, and knows when the watchdog was fed last."""
+    """Replacement for systemd that receives notifications and records when it was fed."""
 
     def __init__(self, path: str, watchdog_s: float) -> None:
         self.watchdog_s = watchdog_s
@@ -112,9 +130,12 @@ class Supervisor:
         self.ready = False
 
     def is_hungry_within(self, seconds: float) -> bool:
-        """Whether the watchdog's time is over before so many seconds are."""
+        """Return whether the watchdog's time ends within this number of seconds."""
         end = time.monotonic() + seconds
-        while (now := time.monotonic()) < end:
+        while True:
+            now = time.monotonic()
+            if now >= end:
+                return False
             try:
                 message = self._socket.recv(4096)
             except TimeoutError:
@@ -124,12 +145,14 @@ class Supervisor:
             self.ready = self.ready or b"READY=1" in message
             if b"WATCHDOG=1" in message:
                 self.fed_at = time.monotonic()
-        return False
 
 
 @process("a frozen loop, restarted by the watchdog", rounds=[0])
 def frozen(bench: Bench, injection: Injection, n: int) -> None:
-    """By systemd's rule: no WATCHDOG=1 for its time, then SIGABRT and a new start. Recovery counts from there."""
+    """Follow systemd's rule: SIGABRT and a new start after the time without WATCHDOG=1.
+
+    The recovery is measured from the new start.
+    """
     supervisor = Supervisor(f"{bench.folder}/notify{time.monotonic_ns()}", 2)
     before = bench.environment
     bench.environment = before | supervisor.environment
@@ -151,7 +174,12 @@ def frozen(bench: Bench, injection: Injection, n: int) -> None:
         bench.environment = before
 
 
-def clock_set(bench: Bench, _injection: Injection, _n: int, to: Callable[[], float]) -> None:
+def clock_set(
+    bench: Bench,
+    _injection: Injection,
+    _n: int,
+    to: Callable[[], float],
+) -> None:
     right = time.time() - time.monotonic()
     time.clock_settime(time.CLOCK_REALTIME, to())
     try:
@@ -163,7 +191,7 @@ def clock_set(bench: Bench, _injection: Injection, _n: int, to: Callable[[], flo
 for name, to in (
     ("wall clock set 1 h forward, and back", lambda: time.time() + 3600),
     ("wall clock set 1 h back, and forward", lambda: time.time() - 3600),
-    # no kernel takes less: it would have been started before 1970
+    # A kernel accepts no earlier time, because it would have been started before 1970.
     ("wall clock set to 1970, and right again", lambda: time.monotonic() + 5),
 ):
     fault("Time", name, None, escs=[])(partial(clock_set, to=to))
@@ -171,14 +199,14 @@ for name, to in (
 
 @fault("Time", "process suspended (SIGSTOP, SIGCONT)", 1.0, rounds=(10, 0.4))
 def suspended(bench: Bench, injection: Injection, seconds: float) -> None:
-    """Nothing old is sent as new."""
+    """Suspend the process. After that it must not send an old value as a new one."""
     bench.gateway.process.send_signal(signal.SIGSTOP)
     time.sleep(seconds)
     injection.cleared()
     bench.gateway.process.send_signal(signal.SIGCONT)
 
 
-# --- the disk; telemetry must not notice anything of it
+# --- the disk, which must not affect telemetry
 
 SLOW_S = 5
 SLOW_DISK = f"""
@@ -186,20 +214,27 @@ import os, time
 for name in ("write", "fsync", "replace", "rename"):
     def slow(*args, _real=getattr(os, name), **options):
         import threading
-        if threading.current_thread() is not threading.main_thread() and os.path.exists(os.environ["KCG_SLOW"]):
+        is_main = threading.current_thread() is threading.main_thread()
+        if not is_main and os.path.exists(os.environ["KCG_SLOW"]):
             time.sleep({SLOW_S} if _real.__name__ == "fsync" else 0.3)
         return _real(*args, **options)
     setattr(os, name, slow)
 """
-"""The disk of a store's thread takes seconds for everything while a file is there. (In the loop's own thread nothing is slow: it must not
-write to the disk at all, which the watch on its system calls would show as silence.)"""
+"""Code that makes the disk of a store's thread slow while a file exists.
+
+The loop's own thread is not slowed down, because it must not write to the disk at all.
+"""
 
 
 @contextlib.contextmanager
 def disk(_: Path) -> Iterator[Bench]:
-    """Two ESCs; the parameters on a small file system of their own; a slow one at will."""
+    """Yield a bench with two ESCs, and a small separate file system for the parameters.
+
+    It can be made slow.
+    """
     folder = Path(tempfile.mkdtemp(prefix="disk."))
-    store, site = folder / "store", folder / "site"
+    store = folder / "store"
+    site = folder / "site"
     store.mkdir()
     run(f"mount -t tmpfs -o size=64k,mode=0700 tmpfs {store}")
     site.mkdir()
@@ -222,7 +257,7 @@ def stores_again(bench: Bench) -> None:
 
 @contextlib.contextmanager
 def full(folder: Path) -> Iterator[None]:
-    """Written to until nothing more fits."""
+    """Fill the file system within the block."""
     filler = folder / "filler"
     with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
         while True:
@@ -233,7 +268,10 @@ def full(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def read_only(folder: Path) -> Iterator[None]:
-    """On top of the one that the gateway has its lock open on, which would be busy."""
+    """Mount the folder read-only within the block.
+
+    It is mounted on top, because the gateway has a lock open on the file system below.
+    """
     run(f"mount --bind {folder} {folder}")
     run(f"mount -o remount,bind,ro {folder}")
     yield
@@ -246,7 +284,7 @@ def refused(
     _n: int,
     bad: Callable[[Path], AbstractContextManager[None]],
 ) -> None:
-    """A master's "save" is refused, and is possible again when the disk is good; telemetry goes on."""
+    """Check that "save" is refused until the disk is good again, while telemetry continues."""
     with RawBus(bench.watched) as master, bad(bench.store):
         master.write(1, *TIMEOUT_OBJECT, 251, 2)
         code = master.store(1)
@@ -260,7 +298,7 @@ on_disk("read-only", None, escs=[])(partial(refused, bad=read_only))
 
 @on_disk("a write that takes 5 s", None, escs=[], rounds=[0])
 def slow(bench: Bench, injection: Injection, _n: int) -> None:
-    """No frame is delayed by it; the "save" is confirmed when it is on the disk."""
+    """Check that no frame is delayed, and that "save" is confirmed when it is on the disk."""
     switch = Path(bench.environment["KCG_SLOW"])
     said = len(bench.gateway.lines)
     switch.touch()
@@ -277,12 +315,13 @@ def slow(bench: Bench, injection: Injection, _n: int) -> None:
 
 @on_disk("parameter file damaged or empty", RESTART_LIMIT_S, settle_s=1, rounds=range(3))
 def damaged(bench: Bench, injection: Injection, n: int) -> None:
-    """It starts with its defaults, says so by a line and EMCY 6300h, and stores again."""
+    """Check that it starts with defaults, reports it by a line and EMCY 6300h, and stores again."""
     stores_again(bench)
     bench.stop()
     (file,) = bench.store.glob("esc1*.params")
     content = file.read_bytes()
-    file.write_bytes((b"", content[: len(content) // 2], bytes(x ^ 0x20 for x in content))[n])
+    contents = (b"", content[: len(content) // 2], bytes(x ^ 0x20 for x in content))
+    file.write_bytes(contents[n])
     start_and_wait(injection)
     bench.wait_log("Running on defaults")
     injection.wait_emergency(1, 0x6300)

@@ -1,14 +1,17 @@
-"""The fault programme: injects every fault into a running gateway in a virtual machine, and judges what came of it.
+"""The fault programme: injects faults into a running gateway in a virtual machine.
 
-    python tests/faults/programme.py [uml|qemu|soak] [--only TEXT]... [--minutes N] [--seed N] [--junit FILE] [--page]
+    python tests/faults/programme.py [uml|qemu|soak] [--only TEXT]... [--minutes N] [--seed N]
+                                     [--junit FILE] [--page]
 
-uml     the faults that need no more than a kernel with vxcan, slcan and vcan, in User Mode Linux
-qemu    those of real drivers, on emulated hardware (tests/vm/setup.sh qemu)
-soak    random ones of uml, one after the other, for minutes or hours: the same ones in the same order for the same seed
+uml     faults that need only a kernel with vxcan, slcan and vcan, in User Mode Linux
+qemu    faults of real drivers, on emulated hardware (tests/vm/setup.sh qemu)
+soak    random faults of uml for minutes or hours, in the same order for the same seed
 
-They set the clock, mount and make interfaces: never on the machine itself. Exits with 1 if one was not healed in time, or a value on
-the bus was wrong, or one was lost that need not have been, or a byte was sent to an ESC. Nothing is run twice. User Mode Linux runs by
-a time of its own (tests/vm/uml_time.c), QEMU by its count of instructions: nothing depends on how fast or busy the machine is.
+Faults set the clock, mount file systems and create interfaces, but never on the machine itself. The
+exit code is 1 if the gateway did not recover in time, a value on the bus was wrong or lost without
+need, or a byte was sent to an ESC. No fault is repeated after a failure. User Mode Linux has a
+separate time (tests/vm/uml_time.c), and QEMU counts instructions. So the result does not depend on
+the speed or load of the machine.
 """
 
 import argparse
@@ -34,7 +37,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 REPORT = "report.json"
 TIMEOUT_S = {"uml": 1500, "qemu": 600}
 NEW_PROCESS = ("missing at start", "kill -9", "SIGTERM", "frozen")
-"""Faults that end the gateway: its memory could not be followed over them."""
+"""Faults that end the gateway, so that its memory could not be followed."""
 MAX_GROWTH_KIB = 2048
 SOAK = Fault("Process", "memory, descriptors and threads after it all", None, print, beds.two)
 
@@ -43,26 +46,36 @@ SOAK = Fault("Process", "memory, descriptors and threads after it all", None, pr
 
 
 def run_inside(args: argparse.Namespace) -> Report:
-    """Run this script in a virtual machine; its rows."""
+    """Run this script in a virtual machine. Return its rows."""
     with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
         timeout_s = TIMEOUT_S.get(args.part, 180 * args.minutes + 300)
         words = [
-            *(sys.executable, PROJECT / "tests/vm/vm_run.py", f"--timeout={timeout_s:g}"),
-            *(f"--backend={'qemu' if args.part == 'qemu' else 'uml'}", f"--rw={folder}", "--"),
-            *(sys.executable, "-B", __file__, args.part, f"--inside={folder}"),
-            *(f"--seed={args.seed}", f"--minutes={args.minutes:g}"),
+            sys.executable,
+            PROJECT / "tests/vm/vm_run.py",
+            f"--timeout={timeout_s:g}",
+            f"--backend={'qemu' if args.part == 'qemu' else 'uml'}",
+            f"--rw={folder}",
+            "--",
+            sys.executable,
+            "-B",
+            __file__,
+            args.part,
+            f"--inside={folder}",
+            f"--seed={args.seed}",
+            f"--minutes={args.minutes:g}",
             *(f"--only={text}" for text in args.only),
         ]
         subprocess.run(list(map(str, words)), stdin=subprocess.DEVNULL, check=False)
-        report, file = Report(), Path(folder, REPORT)
+        report = Report()
+        file = Path(folder, REPORT)
         if file.exists():
             report.read(file)
     return report
 
 
 def conclude(report: Report) -> int:
-    """Say in the end what failed."""
-    failed = [row.told for row in report.values() if row.state == FAILED]
+    """Print the failed faults and the counts. Return the exit code."""
+    failed = [row.text for row in report.values() if row.state == FAILED]
     counts = f"{len(report)} faults: {len(failed)} failed, {len(report) - len(failed)} good"
     print(*failed, counts, sep="\n", flush=True)
     return int(bool(failed) or not report)
@@ -72,7 +85,7 @@ def conclude(report: Report) -> int:
 
 
 def run(faults: Sequence[Fault], report: Report, folder: Path) -> None:
-    """All faults, those with the same bed on one bench; a bench that a fault has broken is made anew."""
+    """Run all faults. Faults with the same bed share a bench, which is replaced if it breaks."""
     for bed in dict.fromkeys(fault.bed for fault in faults):
         waiting = [fault for fault in faults if fault.bed is bed]
         while waiting:
@@ -84,31 +97,43 @@ def run(faults: Sequence[Fault], report: Report, folder: Path) -> None:
                         good = run_one(bench, fault, fault.rounds, report)
                         report.write(folder / REPORT)
             except Exception:
-                # the next one counts as not reached
+                # The next fault counts as not reached.
                 traceback.print_exc()
                 del waiting[:1]
 
 
-def run_one(bench: Bench, fault: Fault, rounds: Sequence[object], report: Report) -> bool:
-    """True if the bench is still good."""
-    begin, row = time.monotonic(), report.of(fault)
+def run_one(
+    bench: Bench,
+    fault: Fault,
+    rounds: Sequence[object],
+    report: Report,
+) -> bool:
+    """Run the rounds of a fault. Return True if the bench is still usable."""
+    begin = time.monotonic()
+    row = report.of(fault)
     good = all(bench.inject(fault, row, each) for each in rounds)
-    print(f"{time.monotonic() - begin:6.1f} s  {row.told}", flush=True)
+    print(f"{time.monotonic() - begin:6.1f} s  {row.text}", flush=True)
     return good
 
 
-def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> None:
-    """Faults until then, of those that the same gateway process lives through; then its memory, descriptors and threads.
+def soak(
+    bench: Bench,
+    report: Report,
+    generator: random.Random,
+    end: float,
+) -> None:
+    """Inject faults that do not end the process until ``end``. Then check the process.
 
-    The memory is judged by its growth and, after an hour or more, by its slope.
+    Descriptors and threads must not grow. The memory is judged by its growth and, after an hour or
+    more, by its slope.
     """
-    faults = [
-        fault
-        for fault in in_order()
-        if fault.bed is beds.two and not any(text in fault.name for text in NEW_PROCESS)
-    ]
+    faults = []
+    for fault in in_order():
+        ends_process = any(text in fault.name for text in NEW_PROCESS)
+        if fault.bed is beds.two and not ends_process:
+            faults.append(fault)
     row = report.of(SOAK)
-    bench.said_instead = "comes and goes"  # as a port does here: it has no line each time
+    bench.said_instead = "comes and goes"  # a flapping port does not cause a line each time
     before = bench.gateway.figures()
     samples: list[Sample] = []
     while time.monotonic() < end:
@@ -123,12 +148,13 @@ def soak(bench: Bench, report: Report, generator: random.Random, end: float) -> 
     print(f"memory: {slope_kib_per_hour(samples):.0f} KiB an hour, {len(samples)} samples")
     row.notes += bench.gateway.growth(before, MAX_GROWTH_KIB)
     row.recovered = 0 if row.notes else row.injected
-    print(row.told, bench.gateway.figures())
+    print(row.text, bench.gateway.figures())
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("part", nargs="?", choices=("uml", "qemu", "soak"), default="uml")
     parser.add_argument("--junit", type=Path, help="write what came of it as a JUnit report")
@@ -141,12 +167,13 @@ def main() -> int:
     if args.part == "soak":
         faults = [SOAK]
     else:
-        mine = [fault for fault in in_order() if fault.machine.lower() == args.part]
-        faults = [f for f in mine if not args.only or any(text in str(f) for text in args.only)]
+        faults = [fault for fault in in_order() if fault.machine.lower() == args.part]
+        if args.only:
+            faults = [each for each in faults if any(text in str(each) for text in args.only)]
     if args.inside is None:
         report = run_inside(args)
         for fault in faults:
-            report.of(fault)  # one that was not reached has failed
+            report.of(fault)  # a fault that was not reached has failed
         if args.junit:
             report.write_junit(args.junit)
         if args.page:

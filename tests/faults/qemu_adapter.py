@@ -1,7 +1,7 @@
-"""A serial adapter on a played USB: the kernel's vhci_hcd (USB/IP) plugs it in, the driver ftdi_sio serves it.
+"""A simulated USB serial adapter. The kernel's vhci_hcd (USB/IP) plugs it in, ftdi_sio drives it.
 
-It says of what it passes on whether parity or stop bits were wrong or the line at break, as the chip does. Only root may plug, and
-only on a kernel with vhci_hcd: the machine of tests/vm.
+Like the chip, it reports wrong parity, wrong stop bits and breaks. Only root may plug it in, and
+only on a kernel with vhci_hcd, which the machine of tests/vm has.
 """
 
 import contextlib
@@ -19,15 +19,27 @@ FULL_SPEED = 2
 _HEADER = struct.Struct(">5I28s")
 _SUBMIT = struct.Struct(">4xi12x8s")
 _SETUP = struct.Struct("<BBHHH")
-_CMD_UNLINK, _RET_SUBMIT, _RET_UNLINK = 2, 3, 4
-_STALL, _UNLINKED = -32, -104
-_DEVICE_TO_HOST, _VENDOR_OR_CLASS = 0x80, 0x60
-_GET_STATUS, _GET_DESCRIPTOR, _GET_CONFIGURATION = 0, 6, 8
-_DEVICE, _CONFIGURATION, _STRING = 1, 2, 3
+_CMD_UNLINK = 2
+_RET_SUBMIT = 3
+_RET_UNLINK = 4
+_STALL = -32
+_UNLINKED = -104
+_DEVICE_TO_HOST = 0x80
+_VENDOR_OR_CLASS = 0x60
+_GET_STATUS = 0
+_GET_DESCRIPTOR = 6
+_GET_CONFIGURATION = 8
+_DEVICE = 1
+_CONFIGURATION = 2
+_STRING = 3
 
 
-def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> None:
-    """Wait until something holds. AssertionError when it does not come."""
+def wait_until(
+    condition: Callable[[], Any],
+    seconds: float,
+    what: str,
+) -> None:
+    """Wait until a condition is true. Raise AssertionError if it stays false."""
     begin = time.monotonic()
     while not condition():
         if time.monotonic() - begin > seconds:
@@ -36,7 +48,7 @@ def wait_until(condition: Callable[[], Any], seconds: float, what: str) -> None:
 
 
 class Line(NamedTuple):
-    """How the chip's UART is set; always eight data bits and one stop bit."""
+    """The settings of the chip's UART. It always has eight data bits and one stop bit."""
 
     baud: int = 115_200
     parity: str = "E"
@@ -44,20 +56,24 @@ class Line(NamedTuple):
 
 ESC_LINE = Line()
 FRESH_LINE = Line(9600, "N")
-STATUS_OVERRUN, STATUS_PARITY, STATUS_FRAMING, STATUS_BREAK = 0x02, 0x04, 0x08, 0x10
-MODEM_STATUS, LINE_STATUS = 0x01, 0x60
+STATUS_OVERRUN = 0x02
+STATUS_PARITY = 0x04
+STATUS_FRAMING = 0x08
+STATUS_BREAK = 0x10
+MODEM_STATUS = 0x01
+LINE_STATUS = 0x60
 FIFO_SIZE = 384
-"""Received bytes, two of status with each packet among them, that the chip holds while nobody reads."""
+"""Received bytes that the chip buffers, including two status bytes for each packet."""
 
 
 def descriptors(strings: Sequence[str]) -> dict[int, bytes]:
-    """By wValue: an FT232BM with one interface and the bulk endpoints 81h and 02h."""
+    """Return the descriptors by wValue: an FT232BM with the bulk endpoints 81h and 02h."""
     found = {
         _DEVICE << 8: bytes.fromhex("12 01 0002 00 00 00 08 0304 0160 0004 01 02 03 01"),
         _CONFIGURATION << 8: bytes.fromhex(
-            "09 02 2000 01 01 00 80 32"  # 32 bytes in all, one interface, bus-powered, 100 mA
+            "09 02 2000 01 01 00 80 32"  # 32 bytes, one interface, bus-powered, 100 mA
             "09 04 00 00 02 FF FF FF 00"  # vendor's class
-            "07 05 81 02 4000 00 07 05 02 02 4000 00"  # bulk, packets of 64
+            "07 05 81 02 4000 00 07 05 02 02 4000 00"  # bulk, packets of 64 bytes
         ),
         _STRING << 8: bytes.fromhex("04 03 0904"),  # English
     }
@@ -68,10 +84,10 @@ def descriptors(strings: Sequence[str]) -> dict[int, bytes]:
 
 
 class SerialAdapter:
-    """An FT232BM; a thread speaks USB/IP on a socket pair. ``plug`` and ``unplug`` are what a hand does.
+    """An FT232BM. A thread serves USB/IP on a socket pair.
 
-    ``received`` counts the bytes and breaks that would have gone out to the ESC once the host had set the line as an ESC's:
-    before that the kernel echoes on a fresh port.
+    ``received`` counts the bytes and breaks that would be sent to the ESC after the host has set
+    the line for an ESC. Before that the kernel echoes on a new port.
     """
 
     def __init__(self, serial_number: str) -> None:
@@ -86,7 +102,7 @@ class SerialAdapter:
         self._ours: socket.socket | None = None
         self._thread: threading.Thread | None = None
         self._asked: deque[int] = deque()  # requests that wait for data
-        self._ready: deque[bytes] = deque()  # packets that wait to be asked for
+        self._ready: deque[bytes] = deque()  # packets that wait for a request
 
     @property
     def plugged(self) -> bool:
@@ -96,15 +112,16 @@ class SerialAdapter:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
 
         def attached() -> bool:
-            with contextlib.suppress(OSError):  # right after an unplug the port is not free yet
+            with contextlib.suppress(OSError):  # just after an unplug the port is not free yet
                 (VHCI / "attach").write_text(f"0 {theirs.fileno()} {0x10001} {FULL_SPEED}")
                 return True
             return False
 
         wait_until(attached, 5, "the USB port is free")
-        theirs.close()  # the kernel holds it
+        theirs.close()  # the kernel keeps it open
         with self._lock:
-            self.line, self._is_set = FRESH_LINE, False
+            self.line = FRESH_LINE
+            self._is_set = False
             self._asked.clear()
             self._ready.clear()
             self._ours = ours
@@ -112,7 +129,7 @@ class SerialAdapter:
         self._thread.start()
 
     def unplug(self) -> None:
-        with contextlib.suppress(OSError):  # it may have lost the device by itself
+        with contextlib.suppress(OSError):  # the kernel may have lost the device already
             (VHCI / "detach").write_text("0")
         if self._thread is not None:
             self._thread.join(5)
@@ -121,14 +138,18 @@ class SerialAdapter:
     # --- the wire
 
     def waiting(self) -> int:
-        """Bytes that wait until the host asks for them."""
+        """Return the number of bytes that wait for a request of the host."""
         with self._lock:
             return sum(len(packet) for packet in self._ready)
 
     def put(self, data: bytes, error: int = 0) -> None:
-        """Bytes from the ESC, and what was wrong with them: packets to the host, as soon as it asks; nothing happens while unplugged."""
+        """Receive bytes from the ESC with a line error, and pass them to the host in packets.
+
+        Bytes are ignored while the adapter is unplugged.
+        """
         if self.line != ESC_LINE:
-            data, error = bytes(len(data)), STATUS_FRAMING
+            data = bytes(len(data))
+            error = STATUS_FRAMING
         with self._lock:
             for at in range(0, len(data) if self.plugged else 0, 62):
                 packet = data[at : at + 62]
@@ -147,7 +168,10 @@ class SerialAdapter:
     def _serve(self, ours: socket.socket) -> None:
         stream = ours.makefile("rb")
         try:
-            while len(head := stream.read(_HEADER.size)) == _HEADER.size:
+            while True:
+                head = stream.read(_HEADER.size)
+                if len(head) < _HEADER.size:
+                    break
                 command, number, _, to_host, endpoint, rest = _HEADER.unpack(head)
                 if command == _CMD_UNLINK:
                     self._unlink(number, int.from_bytes(rest[:4], "big"))
@@ -170,9 +194,9 @@ class SerialAdapter:
             ours.close()
 
     def _give(self, number: int) -> None:
-        """The host asks for data."""
+        """Answer a request of the host for data, now or when there is some."""
         if self._just_reset:
-            # by the port's opening: what does not fill a packet waits for the latency timer
+            # Opening the port resets the chip. An incomplete packet waits for the latency timer.
             self._just_reset = False
             time.sleep(self.latency_ms / 1000)
         with self._lock:
@@ -182,7 +206,7 @@ class SerialAdapter:
                 self._asked.append(number)
 
     def take(self, data: bytes) -> None:
-        """Bytes to the ESC."""
+        """Count bytes that the host sends to the ESC."""
         if self._is_set:
             self.received += len(data)
 
@@ -204,19 +228,26 @@ class SerialAdapter:
         else:
             self._answer(number, answer[:length] if kind & _DEVICE_TO_HOST else b"", taken)
 
-    def vendor(self, request: int, value: int, index: int, length: int) -> bytes:
-        """The answer to a request of the driver ftdi_sio."""
+    def vendor(
+        self,
+        request: int,
+        value: int,
+        index: int,
+        length: int,
+    ) -> bytes:
+        """Return the answer to a request of the driver ftdi_sio."""
         line = self.line
-        if request == 0:  # reset, or clear a buffer: 1 the one of what was received
+        if request == 0:  # reset, or clear a buffer; 1 clears the receive buffer
             if value in (0, 1):
                 with self._lock:
                     self._ready.clear()
             self._just_reset = value == 0
-        elif request == 3:  # baud rate: 3 MHz over a divisor with eighths
+        elif request == 3:  # baud rate: 3 MHz divided by a divisor with eighths
             eighths = (0, 4, 2, 1, 3, 5, 6, 7)[value >> 14 | (index & 1) << 2]
             rate = int(3_000_000 / ((value & 0x3FFF) + eighths / 8 or 1))
-            exact = ESC_LINE.baud if abs(rate - ESC_LINE.baud) < 0.03 * ESC_LINE.baud else rate
-            line = line._replace(baud=exact)
+            if abs(rate - ESC_LINE.baud) < 0.03 * ESC_LINE.baud:
+                rate = ESC_LINE.baud
+            line = line._replace(baud=rate)
         elif request == 4:  # data bits, parity, stop bits, break
             line = line._replace(parity="NOEMS"[value >> 8 & 7])
             self.received += value >> 14 & 1
@@ -230,14 +261,32 @@ class SerialAdapter:
         self._is_set = self._is_set or line == ESC_LINE
         return bytes(length)
 
-    def _answer(self, number: int, data: bytes = b"", taken: int = 0, status: int = 0) -> None:
-        """Complete a request: with data to the host, or with so many bytes taken from it."""
+    def _answer(
+        self,
+        number: int,
+        data: bytes = b"",
+        taken: int = 0,
+        status: int = 0,
+    ) -> None:
+        """Complete a request with data for the host, or with the number of bytes taken from it."""
         size = len(data) or taken
-        head = struct.pack(">5I5i8x", _RET_SUBMIT, number, 0, 0, 0, status, size, 0, 0, 0)
+        head = struct.pack(
+            ">5I5i8x",
+            _RET_SUBMIT,
+            number,
+            0,
+            0,
+            0,
+            status,
+            size,
+            0,
+            0,
+            0,
+        )
         self._send(head + data)
 
     def _unlink(self, number: int, victim: int) -> None:
-        """The host takes a request back."""
+        """Cancel a request of the host."""
         with self._lock:
             status = 0
             if victim in self._asked:

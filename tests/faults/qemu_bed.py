@@ -1,6 +1,7 @@
-"""The bench on emulated hardware: an ESC on a played USB adapter, one on a 16550A UART, two CAN controllers.
+"""The bench on emulated hardware.
 
-What the machine has is told by /sys, ioctl and ``ip``: tests/vm/vm_run.py says what is plugged in.
+One ESC is on a simulated USB adapter, the other on a 16550A UART. There are two CAN controllers.
+tests/vm/vm_run.py defines the hardware. /sys, ioctl and ``ip`` show its state.
 """
 
 import contextlib
@@ -26,7 +27,8 @@ from qemu_adapter import SerialAdapter, wait_until
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.states import Device
 
-WIRE, UART = 0, 1
+WIRE = 0
+UART = 1
 SLACK_NS = 400 * MS
 RATE_HZ = 10
 INFO_EVERY = 20
@@ -39,7 +41,7 @@ _TIOCGICOUNT = 0x545D
 
 
 class LineCounts(NamedTuple):
-    """What a driver has counted on a line, of struct serial_icounter_struct."""
+    """Errors that a driver has counted on a line, from struct serial_icounter_struct."""
 
     framing: int
     overrun: int
@@ -49,7 +51,7 @@ class LineCounts(NamedTuple):
 
 @contextlib.contextmanager
 def beside(device: str) -> Iterator[int]:
-    """A port opened beside whoever has it, as root may; its settings are not touched."""
+    """Open a port that another program has open, which root may. Keep its settings."""
     fd = os.open(device, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         yield fd
@@ -59,15 +61,19 @@ def beside(device: str) -> Iterator[int]:
 
 def line_counts(device: str) -> LineCounts:
     with beside(device) as fd:
-        return LineCounts(*struct.unpack("=20i", fcntl.ioctl(fd, _TIOCGICOUNT, bytes(80)))[6:10])
+        counts = struct.unpack("=20i", fcntl.ioctl(fd, _TIOCGICOUNT, bytes(80)))
+    return LineCounts(*counts[6:10])
 
 
 AS_SET = termios.B115200, termios.CS8 | termios.PARENB, 0
-"""How the gateway sets a port: 8E1, without echo. Until then the kernel echoes on a new one, as a USB port is at each plug-in."""
+"""The gateway's settings of a port: 8E1, without echo.
+
+Before the gateway sets it, the kernel echoes on a new port. A USB port is new after each plug-in.
+"""
 
 
 def line_setting(device: str) -> tuple[int, int, int]:
-    """How a port is set, read from the kernel: speed, what stands for 8E1, echo."""
+    """Read a port's settings from the kernel: speed, the flags of 8E1, and echo."""
     with beside(device) as fd:
         _, _, control, local, _, speed, _ = termios.tcgetattr(fd)
     frame = termios.CSIZE | termios.PARENB | termios.PARODD | termios.CSTOPB
@@ -76,7 +82,7 @@ def line_setting(device: str) -> tuple[int, int, int]:
 
 @contextlib.contextmanager
 def held(device: str) -> Iterator[int]:
-    """A port that another program has open, without echo."""
+    """Keep a port open without echo, as another program does."""
     with beside(device) as fd:
         mode = termios.tcgetattr(fd)
         mode[3] &= ~(termios.ECHO | termios.ECHONL | termios.ICANON)
@@ -91,8 +97,8 @@ def serial_ports() -> set[str]:
 class FarPort(FedEsc):
     """An ESC at the far end of QEMU's serial port.
 
-    QEMU keeps what comes while the port is closed, and delivers it at the next opening: no UART does. So this ESC is silent unless
-    ``is_open`` says that the gateway has the port open.
+    Unlike a UART, QEMU keeps bytes that arrive while the port is closed, and delivers them when it
+    is opened. So this ESC sends only while ``is_open`` reports that the gateway has the port open.
     """
 
     def __init__(self, identity: Identity, is_open: Callable[[str], bool]) -> None:
@@ -102,7 +108,7 @@ class FarPort(FedEsc):
         self._received = 0
         self._fd = os.open("/dev/virtio-ports/com1", os.O_RDWR | os.O_NONBLOCK)
         with held(self.device):
-            pass  # it stays without echo
+            pass  # the port stays without echo
         self._stop = False
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
@@ -111,8 +117,9 @@ class FarPort(FedEsc):
         return self._is_open(self.device) and self.put(data)
 
     def put(self, data: bytes, seconds: float = 1.0) -> bool:
-        """Bytes to the port; whether it took all of them within the time."""
-        done, deadline = 0, time.monotonic() + seconds
+        """Send bytes to the port. Return whether it took all of them within the time."""
+        done = 0
+        deadline = time.monotonic() + seconds
         while done < len(data) and time.monotonic() < deadline:
             try:
                 done += os.write(self._fd, data[done:])
@@ -136,7 +143,7 @@ class FarPort(FedEsc):
 
 
 class WirePort(FedEsc):
-    """An ESC on a played adapter; ``error``: what the adapter says of the frames' bytes."""
+    """An ESC on a simulated adapter. ``error`` is the adapter's status for the frames' bytes."""
 
     def __init__(self, identity: Identity) -> None:
         super().__init__(identity, RATE_HZ, INFO_EVERY)
@@ -151,13 +158,14 @@ class WirePort(FedEsc):
         return self.adapter.plugged
 
     def unplug(self) -> None:
-        """Returns when its device file is gone."""
-        before, self.device = self.device, ""
+        """Unplug the adapter, and wait until its device file is gone."""
+        before = self.device
+        self.device = ""
         self.adapter.unplug()
         wait_until(lambda: before not in serial_ports(), 5, f"{before} gone")
 
     def plug(self) -> None:
-        """Returns when its device file is there, maybe another than before."""
+        """Plug the adapter in, and wait for its device file, which may be another than before."""
         before = serial_ports()
         self.adapter.plug()
         wait_until(lambda: serial_ports() - before, 5, "the adapter's device file")
@@ -190,7 +198,10 @@ def pci_slot(interface: str) -> str:
 
 @contextlib.contextmanager
 def driver_away() -> Iterator[None]:
-    """The first controller is taken from its driver, so its interface is gone; at the end it is back and up."""
+    """Unbind the first controller from its driver, so that its interface is gone.
+
+    At the end of the block the interface is back and up.
+    """
     slot = pci_slot("can0")
     (KVASER / "unbind").write_text(slot)
     yield
@@ -203,29 +214,37 @@ def driver_away() -> Iterator[None]:
 
 
 class MachineBench(Bench):
-    """Two ESCs on two kinds of port, and a gateway on the first controller; the second one watches."""
+    """A bench with two kinds of serial port. The judge is on the second CAN controller."""
 
     def __init__(self) -> None:
-        self._gateway = None  # the feeder asks before it is set
+        self._gateway = None  # the feeder reads it before it is set
         self.wire = WirePort(Identity(2, Layout.LEGACY, Device.JIVEPRO, 12))
         self.uart = FarPort(Identity(1, Layout.V4), self._has_open)
         for name in ("can0", "can1"):
             can_up(name)
         known = table(("--esc", "2"), True, 2)
-        super().__init__("can0", "can1", [self.wire, self.uart], known, slack_ns=SLACK_NS)
+        super().__init__(
+            "can0",
+            "can1",
+            [self.wire, self.uart],
+            known,
+            slack_ns=SLACK_NS,
+        )
 
     def _has_open(self, device: str) -> bool:
-        """Whether the gateway has this file open."""
+        """Return whether the gateway has this file open."""
         gateway = self._gateway
+        if gateway is None:
+            return False
+        folder = f"/proc/{gateway.process.pid}/fd"
         with contextlib.suppress(OSError):
-            folder = f"/proc/{gateway.process.pid}/fd" if gateway else "/nowhere"
             return any(os.readlink(f"{folder}/{fd}") == device for fd in os.listdir(folder))
         return False
 
 
 @contextlib.contextmanager
 def machine(_: Path) -> Iterator[MachineBench]:
-    """The bed."""
+    """Create the bench of the bed."""
     with MachineBench() as bench:
         bench.start()
         yield bench

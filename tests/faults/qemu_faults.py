@@ -1,7 +1,7 @@
-"""The faults of the emulated machine: real drivers for the UART, for a USB adapter and for the CAN controllers.
+"""Faults of the emulated machine, which has real drivers for UART, USB adapter and CAN controllers.
 
-ESC 1 is on the played adapter, ESC 2 on the 16550A; the gateway is on can0, the judge on can1. What a CAN bus does to a driver
-is in can_faults.py, with the kernel's slcan driver.
+ESC 1 is on the simulated adapter, ESC 2 on the 16550A. The gateway is on can0, the judge on can1.
+can_faults.py has the faults of a CAN bus, with the kernel's slcan driver.
 """
 
 import fcntl
@@ -38,9 +38,13 @@ from raw_bus import RawBus
 from serial_faults import Mangle, bit_errors, gone, line_break, mangled, parity, slow_stream
 
 PORT_LIMIT_S = 2.0
-"""By the issue: after a port's return."""
+"""Longest recovery after a port's return, by the requirement."""
 CAN_LIMIT_S = 1.0 + 0.5
-"""By the issue 1 s after an interface's return; half a second more, as this machine is fifteen times slower than a usual one."""
+"""Longest recovery after an interface's return.
+
+The requirement is 1 s. This machine is fifteen times slower than a usual one, so it gets 0.5 s
+more.
+"""
 RECEIVE_OVERRUN = 0x8110
 on_machine = partial(fault, machine="QEMU", bed=machine)
 serial = partial(on_machine, "Serial", limit_s=PORT_LIMIT_S)
@@ -49,7 +53,7 @@ on_wire = partial(serial, escs=[WIRE])
 
 @on_machine("Start", "interface missing and port in use at the start", 3.0, rounds=[0])
 def hampered_start(bench: MachineBench, injection: Injection, _n: int) -> None:
-    """Both come later: the gateway has to wait for each by itself."""
+    """Start without interface and port. The gateway has to wait for each of them separately."""
     bench.stop()
     with driver_away(), held(bench.uart.path):
         bench.start(wait=False)
@@ -66,10 +70,10 @@ def hampered_start(bench: MachineBench, injection: Injection, _n: int) -> None:
 
 @on_wire("USB adapter in use by another program at its return")
 def busy_at_return(bench: MachineBench, injection: Injection, _n: int) -> None:
-    """The first of its port: what comes and goes is summed up later on."""
+    """Keep the port busy. This is the first fault of the port, before flapping is summed up."""
     wire = bench.wire
     wire.unplug()
-    # until echo is off: what that program would echo is not the gateway's doing
+    # The ESC is silent until echo is off, because the other program's echo is not a fault.
     wire.on = False
     wire.plug()
     with held(wire.device) as fd:
@@ -86,7 +90,7 @@ on_wire("USB adapter pulled and put back", rounds=(0.0, 0.3, 1.0, 6.0))(gone)
 
 @on_wire("USB adapter back under another ttyUSB number")
 def renumbered(bench: MachineBench, injection: Injection, _n: int) -> None:
-    """And back under its first one: while another program has not let go of the old one, its number stays taken."""
+    """Change the number: it stays in use while another program has the old device file open."""
     before = bench.wire.device
     with held(before):
         bench.wire.unplug()
@@ -97,15 +101,23 @@ def renumbered(bench: MachineBench, injection: Injection, _n: int) -> None:
 
 
 def misread(
-    bench: MachineBench, injection: Injection, n: int, how: Mangle, error: int, counter: str
+    bench: MachineBench,
+    injection: Injection,
+    n: int,
+    how: Mangle,
+    error: int,
+    counter: str,
 ) -> None:
-    """What the line makes of the bytes, as in User Mode Linux, and here the chip says so: the driver has to count it."""
+    """Change the bytes on the line as in User Mode Linux.
+
+    Here the chip reports an error, and the driver has to count it.
+    """
     wire = bench.wire
 
     def flagged(data: bytes) -> tuple[bytes, bool]:
-        came, whole = how(data)
-        wire.error = 0 if whole else error
-        return came, whole
+        received, is_whole = how(data)
+        wire.error = 0 if is_whole else error
+        return received, is_whole
 
     before = line_counts(wire.device)
     mangled(bench, injection, n, flagged, readable=not injection.escs)
@@ -140,7 +152,7 @@ def port_setting(bench: MachineBench, injection: Injection, _n: int) -> None:
 
 @serial("16550A flooded with garbage at the full line rate", escs=[UART], rounds=[0])
 def flood(bench: MachineBench, injection: Injection, _n: int) -> None:
-    """Three seconds without a gap; the other ESC must not notice."""
+    """Send garbage for three seconds without a gap. The other ESC must not be disturbed."""
     chunk = bytes((i * 37 + i // 251) & 0xFF for i in range(115_200 // 11 // 20))
     bench.uart.on = False
     for _ in range(60):
@@ -152,7 +164,10 @@ def flood(bench: MachineBench, injection: Injection, _n: int) -> None:
 
 @serial("receive overrun while the process is stopped", rounds=[0])
 def overrun(bench: MachineBench, injection: Injection, _n: int) -> None:
-    """More than the kernel and the chip hold; what is read first afterwards is old and must not be sent."""
+    """Send more than the kernel and the chip can buffer.
+
+    The first bytes that are read after that are old, and their values must not be sent.
+    """
     wire = bench.wire
     filler = bytes(range(256)) * 8
     before = line_counts(wire.device).overrun
@@ -174,7 +189,10 @@ def overrun(bench: MachineBench, injection: Injection, _n: int) -> None:
 
 @on_machine("Serial", "another program sets the port to 9600 8N1", 5.0, rounds=(UART, WIRE))
 def reset_by_other(bench: MachineBench, injection: Injection, index: int) -> None:
-    """As a getty does that root starts on the gateway's port. QEMU's far end goes on as before: there it is the setting that is judged."""
+    """Change the settings, as a getty does that root starts on the gateway's port.
+
+    QEMU's far end does not depend on the settings, so there only the settings are judged.
+    """
     injection.escs = [index]
     port = (bench.wire, bench.uart)[index]
     said = len(bench.gateway.lines)
@@ -198,12 +216,15 @@ def reset_by_other(bench: MachineBench, injection: Injection, index: int) -> Non
 
 
 @on_machine(
-    "CAN", "controller taken from its driver and given back", CAN_LIMIT_S, rounds=(0.1, 1.0, 3.0)
+    "CAN",
+    "controller taken from its driver and given back",
+    CAN_LIMIT_S,
+    rounds=(0.1, 1.0, 3.0),
 )
 def rebound(bench: MachineBench, injection: Injection, pause: float) -> None:
-    """The interface is gone, and another one with the same name comes."""
+    """Remove the interface, and create another one with the same name."""
     with driver_away():
-        # else can1 keeps what came last until its next interrupt
+        # Otherwise can1 keeps the last frame until its next interrupt.
         with RawBus("can1") as other:
             other.send(0x7FF)
         time.sleep(pause)
@@ -214,9 +235,12 @@ def rebound(bench: MachineBench, injection: Injection, pause: float) -> None:
 
 @on_machine("CAN", "controller's receive FIFO overrun", None, escs=[])
 def fifo_overrun(bench: MachineBench, injection: Injection, _n: int) -> None:
-    """Its interrupts are masked while the bus sends more than 64 bytes: the driver counts it, the node says EMCY 8110h."""
-    time.sleep(1.2)  # the node says it once a second at most
-    # the SJA1000's, for pread and pwrite of single bytes
+    """Mask the controller's interrupts while the bus sends more than 64 bytes.
+
+    The driver has to count the overrun, and the node has to send EMCY 8110h.
+    """
+    time.sleep(1.2)  # the node sends it at most once a second
+    # registers of the SJA1000, for pread and pwrite of single bytes
     registers = os.open(f"/sys/bus/pci/devices/{pci_slot('can0')}/resource1", os.O_RDWR)
     interrupt_enable = 4
     before = receive_overruns("can0")

@@ -1,4 +1,4 @@
-"""Faults of the serial line and of the ESC behind it. The other ESC's values must not be disturbed by any of them."""
+"""Faults of the serial line and of the ESC behind it. They must not disturb the other ESC."""
 
 import contextlib
 import fcntl
@@ -16,7 +16,8 @@ from harness import Bench, Injection, PtyPort
 from kontronik_can_gw.esc.kontronik.codec import Layout, encode
 from kontronik_can_gw.esc.kontronik.states import Device
 
-LOST, PORT_ERROR = 4, 5
+LOST = 4
+PORT_ERROR = 5
 on_first = partial(fault, "Serial", limit_s=2.0, escs=[0])
 """A fault of the first ESC."""
 
@@ -28,17 +29,17 @@ def port_of(bench: Bench, esc: int = 0) -> PtyPort:
 
 
 def lost(bench: Bench) -> None:
-    """Wait until the link is said to be lost."""
-    bench.wait_until(
-        lambda: bench.watch.value("Esc1Link", "link_state") in (LOST, PORT_ERROR),
-        5,
-        "the link is said to be lost",
-    )
+    """Wait until the link is reported as lost."""
+
+    def is_lost() -> bool:
+        return bench.watch.value("Esc1Link", "link_state") in (LOST, PORT_ERROR)
+
+    bench.wait_until(is_lost, 5, "the link is said to be lost")
 
 
 @contextlib.contextmanager
 def replugged(port: PtyPort) -> Iterator[None]:
-    """Unplug and plug in again; the gateway sees the port when the block ends."""
+    """Unplug a port and plug it in again. It is visible for the gateway after the block."""
     port.unplug()
     link = port.link
     port.link = link.with_name("hidden")
@@ -88,7 +89,7 @@ def gone(bench: Bench, injection: Injection, pause: float) -> None:
 def other_name(bench: Bench, injection: Injection, _n: int) -> None:
     port = port_of(bench)
     before = port.device
-    # keeps the old number taken, as a program does that reads on
+    # keeps the old number in use, like a program that still reads
     held = os.open(before, os.O_RDWR | os.O_NOCTTY)
     try:
         port.unplug()
@@ -101,13 +102,14 @@ def other_name(bench: Bench, injection: Injection, _n: int) -> None:
         os.close(held)
 
 
-# --- what the line makes of the bytes: each takes a frame, and returns what comes and whether the frame is whole in it
+# --- effects of the line: each function gets a frame, and returns the bytes that arrive and whether
+# they contain the complete frame
 
 Mangle = Callable[[bytes], tuple[bytes, bool]]
 
 
 def garbage(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
-    """Whatever comes between whole frames, bits of frames included, no frame is lost."""
+    """Insert garbage or parts of frames between complete frames. No frame may be lost."""
     between = (
         generator.randbytes(generator.randrange(1, 400)),
         b"KODL" + generator.randbytes(generator.randrange(20)),
@@ -119,19 +121,18 @@ def garbage(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
 
 
 def bit_errors(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
-    """Frames that are hit are lost and nothing else; none of them shows a wrong value.
+    """Damage some frames. Only these may be lost, and no value of them may be sent.
 
-    Not hit is what the CRC of the legacy layout leaves out: nobody can see that.
+    Bytes that the legacy layout's CRC does not cover are spared: such damage cannot be detected.
     """
-    at, crc = generator.randrange(len(wire)), len(wire) - 4
+    at = generator.randrange(len(wire))
+    crc = len(wire) - 4
     if generator.random() > 0.3 or crc // 4 * 4 <= at < crc:
         return wire, True
     rest = wire[at + 1 :]
-    hit = (
-        rest,
-        bytes([wire[at] ^ 1 << generator.randrange(8)]) + rest,
-        bytes([generator.randrange(256)]) + wire[at:],
-    )
+    flipped = wire[at] ^ 1 << generator.randrange(8)
+    inserted = generator.randrange(256)
+    hit = (rest, bytes([flipped]) + rest, bytes([inserted]) + wire[at:])
     return wire[:at] + generator.choice(hit), False
 
 
@@ -140,19 +141,35 @@ def line_break(_generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
 
 
 def parity(generator: random.Random, wire: bytes) -> tuple[bytes, bool]:
-    """8N1 for 8E1 reads the parity bit as the next byte's start: what comes out is different from byte to byte."""
-    return bytes(
-        x ^ (0x80 if x.bit_count() & 1 else generator.choice((0, 1, 0x80))) for x in wire
-    ), False
+    """Change the bytes as if 8N1 is used for 8E1.
+
+    The parity bit is taken for the next byte's start bit, so the result differs between bytes.
+    """
+    received = bytearray()
+    for byte in wire:
+        has_odd_parity = byte.bit_count() & 1
+        change = 0x80 if has_odd_parity else generator.choice((0, 1, 0x80))
+        received.append(byte ^ change)
+    return bytes(received), False
 
 
 def slow_stream(generator: random.Random, _wire: bytes) -> tuple[bytes, bool]:
-    """Read twelve times too fast, each bit is a run of equal bits."""
+    """Return bytes of a slow stream that is read twelve times too fast: runs of equal bits."""
     return bytes(generator.choices((0, 0xFF, 0xFE, 0xF0, 0x80, 0xC0, 0xE0), k=12)), False
 
 
-def mangled(bench: Bench, injection: Injection, n: int, how: Mangle, readable: bool) -> None:
-    """Nothing may be disturbed, or nothing is right any more: that a wrong setting is likely is said after a while."""
+def mangled(
+    bench: Bench,
+    injection: Injection,
+    n: int,
+    how: Mangle,
+    readable: bool,
+) -> None:
+    """Change the bytes of the first ESC for a while.
+
+    If they are ``readable``, no value may be disturbed. Otherwise the link is lost, and the log
+    reports a probably wrong parity.
+    """
     bench.escs[0].mangle = how
     try:
         time.sleep(1.5 if readable else 0.8)
@@ -212,7 +229,7 @@ def swapped(bench: Bench, injection: Injection, model: Identity) -> None:
 
 @on_first("a stream that stutters, bytes seconds apart", rounds=[0])
 def stutter(bench: Bench, injection: Injection, _n: int) -> None:
-    """A frame of which the end comes seconds after its beginning is old."""
+    """Send a frame in parts over several seconds. Its values are old when it is complete."""
     fed = bench.escs[0]
     fed.on = False
     time.sleep(0.05)
@@ -227,9 +244,13 @@ def stutter(bench: Bench, injection: Injection, _n: int) -> None:
 
 @on_first("a line that is never silent", settle_s=1)
 def never_silent(bench: Bench, injection: Injection, _n: int) -> None:
-    """Frame behind frame, as many as 115200 baud carry: of one ESC newer values take the place of older ones, of the other none is lost."""
+    """Send as many frames as 115200 baud allow.
+
+    Newer values of this ESC may replace older ones. No value of the other ESC may be lost.
+    """
     fed = bench.escs[0]
-    before, fed.rate_hz = fed.rate_hz, 260
+    before = fed.rate_hz
+    fed.rate_hz = 260
     time.sleep(1.5)
     fed.rate_hz = before
     injection.cleared()
@@ -237,7 +258,10 @@ def never_silent(bench: Bench, injection: Injection, _n: int) -> None:
 
 @on_first("a port that floods", settle_s=1)
 def flood(bench: Bench, injection: Injection, _n: int) -> None:
-    """Rubbish amid the frames, a hundred times as much as 115200 baud carry: the other ESC must not notice."""
+    """Send garbage between frames, a hundred times as much as 115200 baud allow.
+
+    The other ESC must not be disturbed.
+    """
     rubbish = random.Random(5).randbytes(4096).replace(b"K", b"k")
     end = time.monotonic() + 1.5
     while time.monotonic() < end:
@@ -247,7 +271,7 @@ def flood(bench: Bench, injection: Injection, _n: int) -> None:
 
 
 def cycles(bench: Bench, injection: Injection, times: int) -> None:
-    """Nothing grows: memory, descriptors and threads after the cycles are what they were after the first few."""
+    """Check that memory, descriptors and threads do not grow after the first few cycles."""
     ports = [port_of(bench, esc) for esc in range(len(bench.escs))]
     before = bench.gateway.figures()
     for i in range(times):

@@ -1,4 +1,7 @@
-"""Where the values stand in the frames of a DBC: tables made from it by cantools once, for whoever decodes many frames in slow Python."""
+"""Positions of the values in the frames of a DBC.
+
+cantools creates the tables once, so that many frames can be decoded quickly in Python.
+"""
 
 import contextlib
 import io
@@ -11,12 +14,12 @@ from feeder import Identity, info_values, live_values
 LIVE_NAMES = frozenset(live_values(Identity(), 0))
 INFO_NAMES = frozenset(info_values(Identity(), 0))
 NOT_FOLLOWED = frozenset({"losses", "layout", "energy_used"})
-"""Amid an ESC's values: what is the gateway's own."""
+"""Signals in messages of an ESC's values that the gateway itself computes."""
 STATE_STEMS = frozenset({"Link", "Heartbeat", "Emergency"})
 
 
 class Place(NamedTuple):
-    """A signal: its bits, its scaling, and the raw value that means not available (None: it has none)."""
+    """A signal: its bits, its scale, and the raw value for "not available", or None."""
 
     name: str
     start: int
@@ -31,17 +34,17 @@ class Place(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message: whose it is (None: the gateway's), what its values follow from, and its signals."""
+    """A message with the number of its ESC (None for the gateway's own) and its signals."""
 
     can_id: int
     stem: str
     esc: int | None
     kind: str
-    """``live``, ``info`` or ``other``."""
+    """The frame that the values are computed from: ``live``, ``info`` or ``other``."""
     places: tuple[Place, ...]
-    """All signals; of a live or info message only those that are an ESC's values."""
+    """All signals. In a live or info message only the signals that are an ESC's values."""
     flags: tuple[int, int]
-    """Start and mask of the error bits; a mask of 0: none."""
+    """Start and mask of the error bits. The mask is 0 if the message has no error bits."""
 
     @property
     def name(self) -> str:
@@ -58,26 +61,33 @@ def _snake(name: str) -> str:
 def _message(message: Any, count: int) -> Message:
     whose = re.match(r"Esc(\d*)(?=[A-Z])", message.name)
     if whose is None or (count > 1) != bool(whose[1]):
-        stem, esc, prefix = message.name, None, ""
+        stem = message.name
+        esc = None
+        prefix = ""
     else:
-        stem, esc = message.name[whose.end() :], int(whose[1] or 1) - 1
+        stem = message.name[whose.end() :]
+        esc = int(whose[1] or 1) - 1
         prefix = whose[0] if count > 1 else ""
     places: list[Place] = []
     flags: list[Place] = []
     for signal in sorted(message.signals, key=lambda s: int(s.start)):
-        assert (
-            signal.byte_order == "little_endian" and not signal.offset and not signal.is_multiplexer
-        )
+        assert signal.byte_order == "little_endian"
+        assert not signal.offset
+        assert not signal.is_multiplexer
         choices = {str(text): raw for raw, text in (signal.choices or {}).items()}
         place = Place(
-            _snake(signal.name.removeprefix(prefix)),
-            signal.start,
-            (1 << signal.length) - 1,
-            1 << signal.length - 1 if signal.is_signed else 0,
-            float(signal.scale),
-            choices.get("NotAvailable"),
+            name=_snake(signal.name.removeprefix(prefix)),
+            start=signal.start,
+            mask=(1 << signal.length) - 1,
+            sign=1 << signal.length - 1 if signal.is_signed else 0,
+            scale=float(signal.scale),
+            not_available=choices.get("NotAvailable"),
         )
-        (flags if signal.length == 1 and not choices else places).append(place)
+        is_flag = signal.length == 1 and not choices
+        if is_flag:
+            flags.append(place)
+        else:
+            places.append(place)
     kind = "other"
     if esc is not None and stem not in STATE_STEMS:
         known = {place.name for place in places}
@@ -89,24 +99,34 @@ def _message(message: Any, count: int) -> Message:
         places = [place for place in places if place.name in followed]
         flags = [flag for flag in flags if flag.name not in ("replay", "info_valid")]
         assert all(flag.start == flags[0].start + i for i, flag in enumerate(flags))
+    error_bits = (0, 0)
+    if flags and kind != "other":
+        error_bits = (flags[0].start, (1 << len(flags)) - 1)
     return Message(
         message.frame_id,
         stem,
         esc,
         kind,
         tuple(places),
-        (flags[0].start, (1 << len(flags)) - 1) if flags and kind != "other" else (0, 0),
+        error_bits,
     )
 
 
 def table_sent(words: Sequence[str], canopen: bool, escs: int) -> Table:
-    """Of what ``kontronik-can-gw dbc`` prints, of the nodes too if there are any; in this process, as a start takes long in a VM."""
+    """Return the table of the DBC that ``kontronik-can-gw dbc`` prints.
+
+    With ``canopen`` it includes the messages of the nodes. The command runs in this process,
+    because starting a process takes long in a virtual machine.
+    """
     import cantools.database
 
     from kontronik_can_gw.cli import main
 
     found: Table = {}
-    for options in ([], ["--canopen"]) if canopen else ([],):
+    variants: list[list[str]] = [[]]
+    if canopen:
+        variants.append(["--canopen"])
+    for options in variants:
         printed = io.TextIOWrapper(io.BytesIO(), encoding="cp1252", newline="")
         with contextlib.redirect_stdout(printed):
             assert main(["dbc", *words, *options]) == 0

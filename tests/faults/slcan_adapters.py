@@ -1,7 +1,9 @@
-"""Adapters of the Lawicel kind on pseudo terminals, with the kernel's slcan driver on them: a CAN bus with bit rates and error states.
+"""Simulated Lawicel adapters on pseudo terminals, used by the kernel's slcan driver.
 
-A frame reaches every adapter that is open at the same bit rate; without one of them nobody acknowledges it, and the sender's
-controller goes to error passive, as a real one does. The driver sees what an adapter tells of its controller.
+They form a CAN bus with bit rates and error states. A frame reaches every adapter that is open at
+the same bit rate. Without such an adapter the frame is not acknowledged, and the sender's
+controller becomes error passive, as a real one does. The adapters report the state of their
+controllers.
 """
 
 import contextlib
@@ -15,21 +17,22 @@ import time
 import tty
 
 _N_SLCAN = 17
-_TIOCSETD, _SIOCGIFNAME = 0x5423, 0x8910
+_TIOCSETD = 0x5423
+_SIOCGIFNAME = 0x8910
 _RATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 
 
 class Adapter:
-    """One adapter and its interface ``name``; a thread plays its firmware."""
+    """One adapter and its interface ``name``. A thread simulates its firmware."""
 
     def __init__(self, bus: "Bus", name: str) -> None:
         self.name = name
         self.rate: int | None = None
         self.is_open = False
         self.stalled = False
-        """The firmware hangs: it takes nothing and tells nothing."""
+        """The firmware hangs: it neither receives nor sends."""
         self.silent = False
-        """Bus-off: it takes frames from the computer and gives none to the bus."""
+        """Bus-off: it takes frames from the computer but sends none on the bus."""
         self._bus = bus
         self._closed = False
         self._master, self._slave = os.openpty()
@@ -50,16 +53,27 @@ class Adapter:
         subprocess.run(["ip", "link", "set", self.name, "down"], check=True)
 
     def tell(self, text: str) -> None:
-        """Say something to the driver, as the firmware."""
+        """Send a text to the driver, as the firmware does."""
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, text.encode() + b"\r")
 
-    def tell_state(self, state: str, receive: int = 0, transmit: int = 0) -> None:
-        """``a`` active, ``w`` warning, ``p`` passive, ``b`` bus-off, with the error counters."""
+    def tell_state(
+        self,
+        state: str,
+        receive: int = 0,
+        transmit: int = 0,
+    ) -> None:
+        """Report the state ``a`` (active), ``w`` (warning), ``p`` (passive) or ``b`` (bus-off).
+
+        The error counters are part of the report.
+        """
         self.tell(f"s{state}{receive:03d}{transmit:03d}")
 
     def tell_errors(self, codes: str) -> None:
-        """``a`` acknowledge, ``b`` bit0, ``B`` bit1, ``c`` CRC, ``f`` form, ``o`` overrun, ``s`` stuff."""
+        """Report bus errors: ``a`` acknowledge, ``b`` bit0, ``B`` bit1, ``c`` CRC, ``f`` form.
+
+        Further codes are ``o`` for an overrun and ``s`` for a stuff error.
+        """
         self.tell(f"e{len(codes)}{codes}")
 
     def _run(self) -> None:
@@ -89,12 +103,13 @@ class Adapter:
         if kind == b"S":
             self.rate = _RATES[int(command[1:])]
         elif kind == b"O":
-            self.is_open, self.silent = True, False
+            self.is_open = True
+            self.silent = False
         elif kind == b"C":
             self.is_open = False
 
     def close(self) -> None:
-        """Unplug it: the interface goes."""
+        """Unplug the adapter, which removes the interface."""
         self._closed = True
         self._thread.join(2)
         os.close(self._slave)

@@ -1,4 +1,4 @@
-"""What the fault programme makes of what came of its faults, the table of it in docs, and the time of the machine that it runs in."""
+"""The results of the fault programme, their table in docs, and the time of its machine."""
 
 import re
 import subprocess
@@ -16,7 +16,12 @@ from programme import PROJECT, conclude
 from qemu_adapter import SerialAdapter
 
 
-def row(name: str = "x", injected: int = 3, recovered: int = 3, **counts: Any) -> Row:
+def row(
+    name: str = "x",
+    injected: int = 3,
+    recovered: int = 3,
+    **counts: Any,
+) -> Row:
     return Row(name, 2.0, injected=injected, recovered=recovered, **counts)
 
 
@@ -31,19 +36,24 @@ def row(name: str = "x", injected: int = 3, recovered: int = 3, **counts: Any) -
         ({"injected": 0, "recovered": 0}, FAILED),
     ],
 )
-def test_good_is_what_healed_each_time_without_a_wrong_or_lost_value(
-    counts: dict[str, Any], state: str
+def test_a_fault_is_good_if_it_always_healed_without_wrong_or_lost_values(
+    counts: dict[str, Any],
+    state: str,
 ) -> None:
     assert row(**counts).state == state
 
 
-def test_states_stand_in_both_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_both_reports_contain_the_states(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     report = Report(good=row("good"))
     assert conclude(report) == 0
     report["wrong"] = row("wrong", wrong=1)
     assert conclude(report) == 1
     assert capsys.readouterr().out.endswith("2 faults: 1 failed, 1 good\n")
-    out, again = tmp_path / "out", Report()
+    out = tmp_path / "out"
+    again = Report()
     report.write(out)
     again.read(out)
     assert [each.state for each in again.values()] == [GOOD, FAILED]
@@ -54,9 +64,7 @@ def test_states_stand_in_both_reports(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.extended
-def test_a_machine_with_a_time_of_its_own_sleeps_an_hour_at_once_and_its_clock_goes_on_meanwhile() -> (
-    None
-):
+def test_a_machine_with_virtual_time_sleeps_an_hour_at_once() -> None:
     busy = "import time; end = time.monotonic() + 0.1\nwhile time.monotonic() < end: pass"
     command = [
         sys.executable,
@@ -75,16 +83,14 @@ def test_a_machine_with_a_time_of_its_own_sleeps_an_hour_at_once_and_its_clock_g
     assert end - begin in (3600, 3601)
 
 
-def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gateways_from_then_on() -> (
-    None
-):
+def test_bytes_to_an_esc_count_only_after_the_gateway_has_set_the_port() -> None:
     adapter = SerialAdapter("x")
 
     def set_line(divisor: int, parity_and_bits: int) -> None:
         adapter.vendor(3, divisor, 0, 0)
         adapter.vendor(4, parity_and_bits, 0, 0)
 
-    set_line(312, 0x0008)  # 9600 8N1, at the opening
+    set_line(312, 0x0008)  # 9600 8N1, when the port is opened
     adapter.take(b"echo")
     set_line(26, 0x0208)  # 115200 8E1
     adapter.take(b"A")
@@ -93,8 +99,9 @@ def test_bytes_to_an_esc_are_the_kernels_echo_until_the_port_is_set_and_the_gate
     assert adapter.received == 2
 
 
-def test_a_gateway_that_ended_is_said_to_have_ended() -> None:
-    bench, row = Bench.__new__(Bench), Row("x", None)
+def test_a_gateway_that_ended_is_reported_as_ended() -> None:
+    bench = Bench.__new__(Bench)
+    row = Row("x", None)
     with subprocess.Popen(["false"]) as process:
         pass
     bench._gateway = cast(Any, SimpleNamespace(process=process, lines=["the last word"]))
@@ -103,7 +110,7 @@ def test_a_gateway_that_ended_is_said_to_have_ended() -> None:
     assert row.notes == ["the gateway ended with 1; the gateway's last lines: the last word"]
 
 
-def test_the_page_shows_each_fault_healed_without_a_wrong_or_lost_value() -> None:
+def test_the_page_shows_each_fault_healed_without_wrong_or_lost_values() -> None:
     found = shown(PAGE.read_text())
     assert list(found) == [str(fault) for fault in in_order()]
     assert len(set(map(str, FAULTS))) == len(FAULTS)
@@ -111,9 +118,17 @@ def test_the_page_shows_each_fault_healed_without_a_wrong_or_lost_value() -> Non
         assert re.search(r" \| ([1-9]\d*) \| \1 \| [^|]+ \| 0 \| 0 \| good \|$", line), fault
 
 
-def test_rows_that_were_run_take_the_place_of_older_ones_whatever_they_show() -> None:
-    before, fault = PAGE.read_text(), str(in_order()[3])
-    run = Row(fault, 2.0, injected=3, recovered=3, worst_s=0.1, wrong=1)
+def test_new_rows_replace_older_ones_whatever_their_state() -> None:
+    before = PAGE.read_text()
+    fault = str(in_order()[3])
+    run = Row(
+        fault,
+        2.0,
+        injected=3,
+        recovered=3,
+        worst_s=0.1,
+        wrong=1,
+    )
     after = put(before, Report({fault: run}))
     line = f"| {fault} | 3 | 3 | 0.10 s (limit 2 s) | 1 | 0 | failed |"
     assert shown(after) == shown(before) | {fault: line}
@@ -125,7 +140,7 @@ def test_rows_that_were_run_take_the_place_of_older_ones_whatever_they_show() ->
     [(0, 4, True), (100, 4, True), (160, 4, False), (12_000, 4, False), (12_000, 0.9, True)],
 )
 def test_memory_is_judged_by_its_slope(kib_per_hour: float, hours: float, is_good: bool) -> None:
-    """Pages come and go; what a run takes at its beginning does not count."""
+    """Memory varies by pages, and the growth at the beginning of a run is ignored."""
     samples = []
     for second in range(0, round(hours * HOUR_S), 20):
         first = 4000 if second > 600 else second * 6
@@ -137,6 +152,6 @@ def test_memory_is_judged_by_its_slope(kib_per_hour: float, hours: float, is_goo
     assert slope_kib_per_hour(late) == pytest.approx(kib_per_hour, rel=0.02, abs=15)
 
 
-def test_the_slope_of_few_samples_is_none() -> None:
+def test_the_slope_of_few_samples_is_zero() -> None:
     assert slope_kib_per_hour([]) == slope_kib_per_hour([Sample(1, 2)]) == 0
     assert faults_in([]) == []

@@ -1,4 +1,7 @@
-"""The recipe for another output: one class, one line in the gateway's tuple. It sends one invented frame a second for each ESC."""
+"""The recipe for another output: one class, and one line in the gateway's tuple.
+
+The output of this test sends an invented frame for each ESC once a second.
+"""
 
 from pathlib import Path
 
@@ -21,18 +24,24 @@ from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import NmtState
 from kontronik_can_gw.times import SECOND
 
-FIRST_ID, COMMAND_ID = 0x1234500, 0x12
+FIRST_ID = 0x1234500
+COMMAND_ID = 0x12
 ESCS = [EscSettings("left"), EscSettings("right")]
 
 
 class Voltages(Output):
-    """Each ESC's battery voltage in 10 mV, FFFFh: not available; a command by CAN changes the period."""
+    """An output that sends each ESC's battery voltage in 10 mV, or FFFFh if not available.
+
+    A CAN command changes the period.
+    """
 
     def __init__(self, host: OutputHost, now: int) -> None:
         super().__init__()
         self.receive_ids = frozenset({COMMAND_ID})
-        self._escs, self._gateway = host.escs, host.status
-        self._due, self._period = now + SECOND, SECOND
+        self._escs = host.escs
+        self._gateway = host.status
+        self._due = now + SECOND
+        self._period = SECOND
 
     def own_ids(self) -> dict[int, Owner]:
         return {FIRST_ID + n | EXTENDED: Owner(n, "voltage") for n in range(len(self._escs))}
@@ -128,7 +137,7 @@ def test_node_output_stores_parameters_and_plain_output_is_not_asked() -> None:
     assert names_of(gateway, "can0") == ["can0: memory node 5"]
 
 
-def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
+def test_a_further_output_sends_values_and_receives_commands() -> None:
     gateway = Gateway(ESCS, Layout("", "", ()), 0, outputs=[VoltagesMaker()])
     gateway.start(0)
     found = []
@@ -139,23 +148,28 @@ def test_an_output_of_its_own_goes_from_bytes_to_frames_and_back() -> None:
             wire = encode(LiveData(battery_voltage=2400), codec.Layout.V4)
             gateway.receive_bytes(1, wire, now, now)
         gateway.advance(now)
-        found += [(now, f.can_id - FIRST_ID, f.data.hex()) for f in gateway.take_frames(now)]
+        for frame in gateway.take_frames(now):
+            found.append((now, frame.can_id - FIRST_ID, frame.data.hex()))
         if now == 2 * SECOND:
             gateway.receive_frame(CanFrame(COMMAND_ID, b"\x09"), now, now)
-    assert [each for each in found if each[1] == 1] == [
+    sent_for_left = [each for each in found if each[1] == 0]
+    sent_for_right = [each for each in found if each[1] == 1]
+    assert sent_for_right == [
         (SECOND, 1, "6009"),
         (2 * SECOND, 1, "6009"),
-        (2 * SECOND + 2 * SECOND // 10, 1, "ffff"),  # lost: 250 ms after the last
+        (2 * SECOND + 2 * SECOND // 10, 1, "ffff"),  # lost 250 ms after the last frame
         (3 * SECOND, 1, "ffff"),
     ]
-    assert [each for each in found if each[1] == 0] == [(s * SECOND, 0, "ffff") for s in (1, 2, 3)]
+    assert sent_for_left == [(second * SECOND, 0, "ffff") for second in (1, 2, 3)]
 
 
-def test_another_device_with_its_ids_is_noticed() -> None:
+def test_another_device_with_ids_of_a_further_output_is_noticed() -> None:
     gateway = Gateway(ESCS, Layout("", "", ()), 0, outputs=[VoltagesMaker()])
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
-    assert [(each.whose, each.node) for each in gateway.conflicts.take()] == [("voltage", 1)]
+    (conflict,) = gateway.conflicts.take()
+    assert conflict.whose == "voltage"
+    assert conflict.node == 1
 
 
 @pytest.mark.parametrize(
@@ -166,8 +180,10 @@ def test_another_device_with_its_ids_is_noticed() -> None:
         (0x581, "SDO answers of CANopen node 1"),
     ],
 )
-def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused_by_name(
-    tmp_path: Path, number: int, said: str
+def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused(
+    tmp_path: Path,
+    number: int,
+    said: str,
 ) -> None:
     text = f'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Logger\nBO_ {number} Volts: 8 Gw\n'
     text += ' SG_ esc2BatteryVoltage : 0|16@1+ (0.01,0) [0|0] "V" Logger\n'

@@ -1,4 +1,4 @@
-"""What a gateway sends at a known time, from bytes to frames: values that are easily taken for others, or not sent at all."""
+"""Frames that a gateway sends at known times: values that are easily confused or not sent."""
 
 import pytest
 from dbc_bench import compiled
@@ -20,7 +20,7 @@ SPEED = Sig("ElectricalSpeed", 0, 32, unit="1/min")
 
 
 def text_of(signal: Sig, more: str = EVENT) -> str:
-    """A DBC with one message of one signal, as a rule sent with each live frame."""
+    """Return a DBC with one message of one signal. By default each live frame sends it."""
     return dbc_text([Msg("M", 256, 8, [signal])], more)
 
 
@@ -29,7 +29,10 @@ def wire(**values: int) -> bytes:
 
 
 class Bench:
-    """One message, as a rule sent with each live frame, of a gateway that is awake at each deadline."""
+    """A gateway with one message that runs at each of its deadlines.
+
+    By default each live frame sends the message.
+    """
 
     def __init__(self, signal: Sig, more: str = EVENT) -> None:
         self.gateway = Gateway((ESC,), compiled(text_of(signal, more)), 0)
@@ -38,7 +41,7 @@ class Bench:
         self.first = self.take()
 
     def live(self, **values: int) -> int:
-        """A period later a live frame comes; what the message holds then."""
+        """Receive a live frame after one period. Return the value of the message after that."""
         return int.from_bytes(self.read(wire(**values))[-1], "little")
 
     def info(self, device: Device) -> None:
@@ -46,18 +49,21 @@ class Bench:
         self.read(encode(info, codec.Layout.V4))
 
     def read(self, data: bytes) -> list[bytes]:
-        """A period later bytes come; the frames sent until and with them."""
+        """Receive bytes after one period. Return the frames sent until then and because of them."""
         sent = self.wait(PERIOD)
         self.gateway.receive_bytes(0, data, self.now, self.now)
         self.gateway.advance(self.now)
         return sent + self.take()
 
     def wait(self, ns: int) -> list[bytes]:
-        end, sent = self.now + ns, []
-        while (due := self.gateway.next_deadline()) <= end:
+        end = self.now + ns
+        sent = []
+        due = self.gateway.next_deadline()
+        while due <= end:
             self.now = max(self.now, due)
             self.gateway.advance(self.now)
             sent += self.take()
+            due = self.gateway.next_deadline()
         self.now = end
         return sent
 
@@ -65,13 +71,27 @@ class Bench:
         return [frame.data for frame in self.gateway.take_frames(self.now)]
 
 
-BEC_CURRENT = Sig("BecCurrent", 0, 16, factor="0.01", maximum="655", unit="A")
+BEC_CURRENT = Sig(
+    "BecCurrent",
+    0,
+    16,
+    factor="0.01",
+    maximum="655",
+    unit="A",
+)
 NO_BEC_CURRENT = 0xFFFF
 
 
-@pytest.mark.parametrize(("device", "then"), [(Device.JIVEPRO, NO_BEC_CURRENT), (Device.KOSMIK, 5)])
+@pytest.mark.parametrize(
+    ("device", "then"),
+    [
+        (Device.JIVEPRO, NO_BEC_CURRENT),
+        (Device.KOSMIK, 5),
+    ],
+)
 def test_a_jivepros_bec_current_stays_unavailable_without_information(
-    device: Device, then: int
+    device: Device,
+    then: int,
 ) -> None:
     bench = Bench(BEC_CURRENT)
     bench.info(device)
@@ -82,43 +102,51 @@ def test_a_jivepros_bec_current_stays_unavailable_without_information(
     assert bench.gateway.escs[0].info is None
 
 
-def test_after_an_outage_of_the_bus_what_has_no_cycle_is_sent_again() -> None:
+def test_messages_without_a_cycle_are_sent_again_after_a_bus_outage() -> None:
     bench = Bench(SPEED)
     bench.live(electrical_speed=30_000)
-    bench.wait(SECOND)  # telemetry is lost, and what was sent of it did not reach the bus
+    bench.wait(SECOND)  # telemetry is lost, and the frame that shows it did not reach the bus
     bench.gateway.can_returned(bench.now)
     assert [data[:4] for data in bench.take()] == [b"\xff\xff\xff\xff"]
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "per_second"), [(EVENT, "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)]
+    ("kind", "name", "per_second"),
+    [(EVENT, "Uptime", 1), (ON_CHANGE, "CrcErrors", 10)],
 )
 def test_counters_without_a_cycle_do_not_go_stale(kind: str, name: str, per_second: int) -> None:
     bench = Bench(Sig(name, 0, 32, unit="s" if name == "Uptime" else ""), kind)
     good = wire(battery_voltage=5000)
     sent: list[bytes] = []
+    damaged = good[:20] + b"\x55" + good[21:]
     for n in range(500):  # for 5 s; each tenth frame is damaged
-        sent += bench.read(good if n % 10 else good[:20] + b"\x55" + good[21:])
+        sent += bench.read(good if n % 10 else damaged)
     assert 3 * per_second <= int.from_bytes(sent[-1][:4], "little") <= 5 * per_second
 
 
-@pytest.mark.parametrize(("more", "link"), [(0, LinkState.OK), (1, LinkState.DEGRADED)])
+@pytest.mark.parametrize(
+    ("more", "link"),
+    [
+        (0, LinkState.OK),
+        (1, LinkState.DEGRADED),
+    ],
+)
 def test_a_link_is_degraded_above_a_tenth_of_dropped_bytes(more: int, link: LinkState) -> None:
-    """In a second 18 frames and two frames' length of noise come, and one byte more."""
+    """18 frames and noise of two frames' length arrive in a second, and ``more`` bytes."""
     bench = Bench(SPEED)
     frame = wire(electrical_speed=1)
-    bench.read(frame)  # from this one on the bytes are counted
+    bench.read(frame)  # bytes are counted after the first frame
     noise = bytes(2 * len(frame) + more)
     assert (len(noise) * 10 > 18 * len(frame) + len(noise)) == bool(more)
     for n in range(18):
         bench.wait(55 * MS - PERIOD)
         bench.read(noise + frame if n == 0 else frame)
     assert bench.gateway.escs[0].link is LinkState.OK
-    bench.wait(20 * MS)  # the second is over
+    bench.wait(20 * MS)  # the second has ended
     assert bench.gateway.escs[0].link is link
 
 
-def test_a_file_with_a_byte_order_mark_and_an_enumeration_by_its_text_is_read() -> None:
+def test_a_dbc_with_a_byte_order_mark_and_a_text_enumeration_is_read() -> None:
     cycle = 'BA_ "GenMsgSendType" BO_ 256 "Cyclic";\nBA_ "GenMsgCycleTime" BO_ 256 20;\n'
     (message,) = compiled("\ufeff" + text_of(SPEED, cycle)).messages
     assert message.cycle_ns == 20 * MS

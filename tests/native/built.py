@@ -1,4 +1,4 @@
-"""The core in C, compiled for a test; and Python with one under AddressSanitizer and UndefinedBehaviorSanitizer."""
+"""Compiles the C core for a test, also with AddressSanitizer and UndefinedBehaviorSanitizer."""
 
 import os
 import shutil
@@ -19,7 +19,7 @@ COMPILERS = ["gcc", pytest.param("clang", marks=pytest.mark.extended)]
 
 
 def there(program: str | None = None) -> str:
-    """A compiler, as a rule the machine's; the test is skipped where there is none."""
+    """Return a compiler, by default the machine's. Skip the test if it is missing."""
     found = compiler() if program is None else shutil.which(program)
     if found is None:
         pytest.skip("no C compiler: sudo apt-get install gcc libc6-dev clang")
@@ -27,13 +27,16 @@ def there(program: str | None = None) -> str:
 
 
 def built(target: Path, *options: str, program: str | None = None) -> Path:
-    """The core as a shared object."""
+    """Compile the core as a shared object. Return its path."""
     assert compile_core(target, options, there(program)) is None
     return target
 
 
 def run_sanitized(folder: Path, *command: str) -> str:
-    """What Python prints with these arguments and the core's path. The sanitizers' libraries must be loaded before all others."""
+    """Run Python with these arguments and the path of a sanitized core. Return its output.
+
+    The sanitizers' libraries must be loaded before all others.
+    """
     target = built(folder / "core.so", *SANITIZED, *OPTIONS)
     asked = [[there(), f"-print-file-name=lib{name}.so"] for name in ("asan", "ubsan")]
     found = [subprocess.run(each, capture_output=True, text=True, check=True) for each in asked]
@@ -43,6 +46,12 @@ def run_sanitized(folder: Path, *command: str) -> str:
         "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
     }
     words = [sys.executable, *command, str(target)]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
     return done.stdout

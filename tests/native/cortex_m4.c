@@ -1,4 +1,7 @@
-/* Start of a program on QEMU's mps2-an386 (Cortex-M4): vectors, memory, and the names of the files that main is given (INPUTS). */
+/* Start of a program on QEMU's mps2-an386 (Cortex-M4).
+
+   It has the vectors, prepares the memory, and passes the names of the input files (INPUTS) to
+   main. */
 #include <stdint.h>
 #include <string.h>
 
@@ -25,4 +28,7 @@ void reset(void)
     exit(main(sizeof names / sizeof *names + 1, argv));
 }
 
-__attribute__((section(".vectors"), used)) static void (*const vectors[])(void) = {(void (*)(void))(uintptr_t)_stack, reset};
+__attribute__((section(".vectors"), used)) static void (*const vectors[])(void) = {
+    (void (*)(void))(uintptr_t)_stack,
+    reset,
+};

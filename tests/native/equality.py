@@ -1,4 +1,8 @@
-"""The core in C beside the core in Python: the same random DBC, bytes and times; every frame, event, counter and deadline equal."""
+"""Compares the C core with the Python core.
+
+Both get the same random DBC, bytes and times. Every frame, event, counter and deadline must be
+equal.
+"""
 
 import math
 import random
@@ -51,34 +55,53 @@ _STEPS = (0, 1_000, 100_000, MS, 2 * MS, 5 * MS, 10 * MS, 10 * MS, 10 * MS, 50 *
 
 def settings(chance: random.Random, number: int) -> EscSettings:
     part = chance.choice((300, MAX_GEAR))
+    pole_pairs = chance.choice((1, 2, 7, 14, 255))
+    numerator = chance.randint(1, part)
+    denominator = chance.randint(1, part)
     return EscSettings(
         f"esc{number + 1}",
-        chance.choice((1, 2, 7, 14, 255)),
-        Fraction(chance.randint(1, part), chance.randint(1, part)),
+        pole_pairs,
+        Fraction(numerator, denominator),
         chance.choice((0, 0, 6, 14)),
         chance.choice((20, 60, 250, 1000)) * MS,
         chance.choice((1, 5, 50)),
     )
 
 
-def dbc(chance: random.Random, escs: Sequence[EscSettings], most: int = 8) -> tuple[str, DbcConfig]:
-    """A random DBC, and how its signals are bound; not always one that the gateway accepts. ``most`` messages."""
+def dbc(
+    chance: random.Random,
+    escs: Sequence[EscSettings],
+    most: int = 8,
+) -> tuple[str, DbcConfig]:
+    """Return a random DBC with up to ``most`` messages, and its bindings.
+
+    The gateway does not accept all of them.
+    """
     maker = LayoutMaker(chance, escs)
     messages = [maker.message() for _ in range(chance.randint(1, most))]
     if chance.random() < 0.4:
         messages.append(protected(chance, escs))
-    more = "\n".join(
-        f'BA_ "GenMsgSendType" BO_ {m.dbc_id} {chance.randrange(5)};\n'
-        f'BA_ "GenMsgCycleTime" BO_ {m.dbc_id} {chance.choice((5, 10, 12, 20, 50, 100, 1000))};\n'
-        f'BA_ "GenMsgDelayTime" BO_ {m.dbc_id} {chance.choice((0, 0, 0, 5, 20, 25, 200))};'
-        for m in messages
-    )
-    ids = {"Protected": 0x1234} if any(m.name == "Protected" for m in messages) else {}
-    return dbc_text(messages, more), DbcConfig(bind=bindings(messages), e2e_data_ids=ids)
+    attributes = []
+    for message in messages:
+        place = f"BO_ {message.dbc_id}"
+        send_type = chance.randrange(5)
+        cycle = chance.choice((5, 10, 12, 20, 50, 100, 1000))
+        delay = chance.choice((0, 0, 0, 5, 20, 25, 200))
+        attributes.append(f'BA_ "GenMsgSendType" {place} {send_type};')
+        attributes.append(f'BA_ "GenMsgCycleTime" {place} {cycle};')
+        attributes.append(f'BA_ "GenMsgDelayTime" {place} {delay};')
+    has_protected = any(message.name == "Protected" for message in messages)
+    ids = {"Protected": 0x1234} if has_protected else {}
+    config = DbcConfig(bind=bindings(messages), e2e_data_ids=ids)
+    return dbc_text(messages, "\n".join(attributes)), config
 
 
-def layout(chance: random.Random, escs: Sequence[EscSettings], most: int = 8) -> Layout:
-    """A random layout that the gateway accepts."""
+def layout(
+    chance: random.Random,
+    escs: Sequence[EscSettings],
+    most: int = 8,
+) -> Layout:
+    """Return a random layout that the gateway accepts."""
     while True:
         try:
             text, chosen = dbc(chance, escs, most)
@@ -88,7 +111,7 @@ def layout(chance: random.Random, escs: Sequence[EscSettings], most: int = 8) ->
 
 
 def protected(chance: random.Random, escs: Sequence[EscSettings]) -> Msg:
-    """A message with an alive counter and perhaps a CRC of AUTOSAR E2E profile 1."""
+    """Return a message with an alive counter and perhaps a CRC of AUTOSAR E2E profile 1."""
     prefix = f"Esc{chance.randint(1, len(escs))}" if len(escs) > 1 else ""
     voltage = Sig(f"{prefix}BatteryVoltage", 24, 16, unit="V", factor="0.01")
     signals = [Sig("Alive", 8, chance.choice((2, 4, 8, 16))), voltage]
@@ -98,57 +121,77 @@ def protected(chance: random.Random, escs: Sequence[EscSettings]) -> Msg:
 
 
 def stream(chance: random.Random) -> bytes:
-    """Some frames, in part damaged, cut, and with rubbish around them."""
+    """Return some frames. A few are damaged or cut, and some have garbage around them."""
     data = b""
     for _ in range(chance.choice((1, 1, 1, 1, 1, 2, 3, 12))):
         wire = WireLayout.V4 if chance.random() < 0.95 else WireLayout.LEGACY
-        one = encode(random_live(chance) if chance.random() < 0.8 else random_info(chance), wire)
+        is_live = chance.random() < 0.8
+        one = encode(random_live(chance) if is_live else random_info(chance), wire)
         if chance.random() < 0.1:
             at = chance.randrange(len(one))
-            one = one[:at] + bytes((one[at] ^ 1 << chance.randrange(8),)) + one[at + 1 :]
+            flipped = one[at] ^ 1 << chance.randrange(8)
+            one = one[:at] + bytes((flipped,)) + one[at + 1 :]
         if chance.random() < 0.1:
             one = one[: chance.randrange(len(one))]
         if chance.random() < 0.03:  # a CRC that covers 34 bytes
             one = one[:34] + crc32(one[:34]).to_bytes(4, "little")
         if chance.random() < 0.08:
-            one = bytes(chance.choices(b"KODLI\0\xff\xf0a", k=chance.randrange(60))) + one
+            garbage = chance.choices(b"KODLI\0\xff\xf0a", k=chance.randrange(60))
+            one = bytes(garbage) + one
         data += one
     return data
 
 
 @cache
 def _streams() -> list[bytes]:
-    """Enough of them: to make one takes longer than both cores take for it."""
+    """Return many streams. Creating one takes longer than both cores need to read it."""
     chance = random.Random(0)
     return [stream(chance) for _ in range(1000)]
 
 
 def _difference(*sides: Sequence[CanFrame]) -> str:
-    """The first frame that is another."""
-    texts = [[f"{f.can_id:X} {f.data.hex()} {f.page}" for f in frames] for frames in sides]
-    place, pair = next((n, p) for n, p in enumerate(zip_longest(*texts)) if p[0] != p[1])
-    return f"frame {place} of {len(texts[0])} and {len(texts[1])}: {pair[0]}, {pair[1]}"
+    """Describe the first frame that differs."""
+    texts = []
+    for frames in sides:
+        texts.append([f"{frame.can_id:X} {frame.data.hex()} {frame.page}" for frame in frames])
+    lengths = f"{len(texts[0])} and {len(texts[1])}"
+    for place, (one, other) in enumerate(zip_longest(*texts)):
+        if one != other:
+            return f"frame {place} of {lengths}: {one}, {other}"
+    raise AssertionError("no frame differs")
 
 
 _STATE_EACH = 10
 STATE = (
-    *("live", "info", "last_live", "last_info", "link", "layout", "cells", "last_cells"),
-    *(
-        "counters",
-        "frame_rate",
-        "losses",
-        "late_frames",
-        "suspect_frames",
-        "live_ns",
-        "last_info_ns",
-    ),
-    *("info_bound_ns", "pole_pairs", "output_divisor", "gear_denominator"),
-    *("energy_mw_ns", "run_time_ns"),
+    "live",
+    "info",
+    "last_live",
+    "last_info",
+    "link",
+    "layout",
+    "cells",
+    "last_cells",
+    "counters",
+    "frame_rate",
+    "losses",
+    "late_frames",
+    "suspect_frames",
+    "live_ns",
+    "last_info_ns",
+    "info_bound_ns",
+    "pole_pairs",
+    "output_divisor",
+    "gear_denominator",
+    "energy_mw_ns",
+    "run_time_ns",
 )
 
 
 class BothSlots:
-    """A slot of both cores, given the same calls. It carries random objects of the shipped EDS, or is a transfer of random values."""
+    """A slot of both cores that gets the same calls.
+
+    It has random objects of the shipped EDS, or is a transfer of random values.
+    """
 
     def __init__(self, chance: random.Random, *both: Slot) -> None:
         self.chance = chance
@@ -159,18 +202,20 @@ class BothSlots:
         self._call("configure", self.settings, START)
 
     def act(self, now: int) -> None:
-        """Something is done with it: as a rule it is started."""
-        chance, what = self.chance, self.chance.random()
-        if what < 0.3:
+        """Do something with the slot. Most often it is started."""
+        chance = self.chance
+        action = chance.random()
+        if action < 0.3:
             other = None if chance.random() < 0.3 else self._random()
             if self.started and self.settings is not None and other is not None:
-                other = other._replace(plan=self.settings.plan)  # only a stopped one is filled anew
+                # Only a stopped slot gets another plan.
+                other = other._replace(plan=self.settings.plan)
             self.settings = other
             self._call("configure", other, now)
-        elif what < 0.6 or not self.started:
+        elif action < 0.6 or not self.started:
             self.started = True
             self._call("start", now)
-        elif what < 0.7:
+        elif action < 0.7:
             self.started = False
             self._call("stop")
         else:
@@ -186,25 +231,32 @@ class BothSlots:
         for variable in chance.sample(_mappable(), chance.randint(1, 8)):
             if sum(map(bits_of, [*mapped, variable])) <= 64:
                 mapped.append(variable)
-        times = (chance.choice((0, 0, 5, 20, 25)) * MS, chance.choice((0, 0, 7, 500)) * MS)
+        inhibit_ns = chance.choice((0, 0, 5, 20, 25)) * MS
+        timer_ns = chance.choice((0, 0, 7, 500)) * MS
         if self.is_transfer:
-            fill, page = chance.getrandbits(8 * FILL), 64 + 3 * chance.randrange(40)
-            of_id = chance.choice((0x18040A2A, 0x18040A2A, 0x18040A2B)), chance.random() < 0.9
-            return SlotSettings(transfer_plan(chance), *of_id, *times, fill, page)
+            fill = chance.getrandbits(8 * FILL)
+            page = 64 + 3 * chance.randrange(40)
+            can_id = chance.choice((0x18040A2A, 0x18040A2A, 0x18040A2B))
+            by_event = chance.random() < 0.9
+            plan = transfer_plan(chance)
+            return SlotSettings(plan, can_id, by_event, inhibit_ns, timer_ns, fill, page)
         plan = compile_pdo(mapped)
-        return SlotSettings(plan, chance.randrange(1, 0x700), chance.random() < 0.8, *times)
+        can_id = chance.randrange(1, 0x700)
+        return SlotSettings(plan, can_id, chance.random() < 0.8, inhibit_ns, timer_ns)
 
 
 FILL = 2
-"""Bytes at the begin of a transfer that its owner fills."""
+"""Bytes at the beginning of a transfer that its owner fills."""
 
 
 def transfer_plan(chance: random.Random) -> SlotPlan:
-    """Up to seven values as integers or floats of any length; their Error code is the type's limit.
+    """Return a transfer of up to seven values as integers or floats of any length.
 
-    One that the core in C can express: slots of one id are all there, and count together.
+    The code for an error is the limit of the type. The C core can express the transfer: slots of
+    one id must all be in the same core, and they count together.
     """
-    at, signals = 8 * FILL, []
+    at = 8 * FILL
+    signals = []
     sources = [v for v in VALUES.values() if v.supplied and v.kind is not Kind.OBJECT]
     for source in chance.sample(sources, chance.randint(1, 7)):
         is_float = chance.random() < 0.4
@@ -214,11 +266,21 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
             break
         high = (1 << length - signed) - 1
         cut = chance.choice((0, 0, 0, length // 3))
-        pieces = [Piece(cut, length - cut, at)] + [Piece(0, cut, at + length - cut)] * (cut > 0)
+        pieces = [Piece(cut, length - cut, at)]
+        if cut > 0:
+            pieces.append(Piece(0, cut, at + length - cut))
         codes = (0x7E00, 0x7BFF) if is_float else (0, high)
         signal = SignalPlan(
-            *(source.name, "", Role.SOURCE, length, signed, is_float, tuple(pieces)),
-            *(-high - 1 if signed else 0, high, *codes),
+            source.name,
+            "",
+            Role.SOURCE,
+            length,
+            signed,
+            is_float,
+            tuple(pieces),
+            -high - 1 if signed else 0,
+            high,
+            *codes,
             slope=Fraction(chance.choice((1, 1, 1, 1000)), source.per_unit),
             intercept=Fraction(chance.choice(("0", "0", "273.15"))),
             source=source,
@@ -228,11 +290,31 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
         signals.append(signal)
         at += length
     plan = MessagePlan(
-        *("transfer", 0, True, False, (at + 7) // 8, SendType.EVENT, 0, 0, tuple(signals)),
-        *(frozenset({0}), frozenset({Group.LIVE})),
+        "transfer",
+        0,
+        True,
+        False,
+        (at + 7) // 8,
+        SendType.EVENT,
+        0,
+        0,
+        tuple(signals),
+        frozenset({0}),
+        frozenset({Group.LIVE}),
     )
-    seed, paced = chance.randrange(1 << 16), chance.random() < 0.7
-    found = SlotPlan(plan, compile_pack(plan), Event.LIVE, 0, None, False, "", seed, paced)
+    seed = chance.randrange(1 << 16)
+    paced = chance.random() < 0.7
+    found = SlotPlan(
+        plan,
+        compile_pack(plan),
+        Event.LIVE,
+        0,
+        None,
+        False,
+        "",
+        seed,
+        paced,
+    )
     try:
         slot_rows(found, EscSettings().protocol)
     except NotInCore:
@@ -252,7 +334,7 @@ def _mappable() -> list[Variable]:
 
 
 class Both:
-    """Both cores, given the same calls."""
+    """Both cores, which get the same calls."""
 
     def __init__(
         self,
@@ -261,7 +343,9 @@ class Both:
         escs: Sequence[EscSettings],
         layout: Layout,
     ) -> None:
-        self.chance, self.escs, self.layout = chance, escs, layout
+        self.chance = chance
+        self.escs = escs
+        self.layout = layout
         self.silent = chance.random() < 0.3
         self.now = START
         self.events: tuple[list[Any], list[Any]] = ([], [])
@@ -269,32 +353,39 @@ class Both:
         self.python = PythonCore(*given)
         slots = chance.choice((0, 1, 3))
         self.native = NativeCore(library, *given, slots)
-        self.slots = [
-            BothSlots(chance, self.python.slot(esc), self.native.slot(esc))
-            for esc in range(len(self.escs))
-            for _ in range(slots)
-        ]
+        self.slots = []
+        for esc in range(len(self.escs)):
+            for _ in range(slots):
+                both = BothSlots(chance, self.python.slot(esc), self.native.slot(esc))
+                self.slots.append(both)
         self.python.followers = [Follower(Event.ALL, lambda *event: self.events[0].append(event))]
         self.native.followers = [Follower(Event.ALL, lambda *event: self.events[1].append(event))]
         self.count = self.compared = 0
         self._tell(self.python.status)
 
     def _tell(self, status: GatewayStatus) -> None:
-        """What the owner of both knows of the gateway."""
-        for name in (name.removeprefix("gateway_") for name in GATEWAY if name != "escs_ok"):
+        """Give both cores the state of the gateway."""
+        for row in GATEWAY:
+            if row == "escs_ok":
+                continue
+            name = row.removeprefix("gateway_")
             for core in (self.python, self.native):
                 setattr(core.status, name, getattr(status, name))
 
     def call(self, name: str, *arguments: Any) -> None:
-        """One call to both."""
+        """Call the same method of both cores."""
         getattr(self.python, name)(*arguments)
         getattr(self.native, name)(*arguments)
 
     def compare(self) -> None:
-        """What came out, each time; the state of the ESCs, which keeps what is wrong, now and then."""
+        """Compare the output each time, and the state of the ESCs every tenth time.
+
+        A wrong state remains, so it is found later.
+        """
         for slot in self.slots:
             assert slot.both[0].is_pending == slot.both[1].is_pending
-        frames, others = self.python.take(self.now), self.native.take(self.now)
+        frames = self.python.take(self.now)
+        others = self.native.take(self.now)
         assert frames == others, _difference(frames, others)
         self.count += len(frames)
         assert self.events[0] == self.events[1], self.events
@@ -313,7 +404,7 @@ class Both:
                 assert getattr(esc, name) == getattr(other, name), name
 
     def run(self, steps: int) -> int:
-        """Frames compared in so many steps."""
+        """Run this number of steps. Return the number of compared frames."""
         self.call("repeat", self.now)
         self.compare()
         for _ in range(steps):
@@ -325,36 +416,45 @@ class Both:
         return self.count
 
     def step(self) -> None:
-        """Something happens, and time passes."""
+        """Let time pass and a random event happen."""
         chance = self.chance
-        self.now += (
-            chance.choice(_STEPS) if chance.random() < 0.99 else chance.randrange(30 * SECOND)
-        )
-        esc, what = chance.randrange(len(self.escs)), chance.random()
-        if what < 0.1:
+        if chance.random() < 0.99:
+            self.now += chance.choice(_STEPS)
+        else:
+            self.now += chance.randrange(30 * SECOND)
+        esc = chance.randrange(len(self.escs))
+        event = chance.random()
+        if event < 0.1:
             pass
-        elif what < 0.12:
+        elif event < 0.12:
             self.call("port", esc, chance.random() < 0.5, self.now)
-        elif what < 0.13:
+        elif event < 0.13:
             self.call("apply", esc, settings(chance, esc))
-        elif what < 0.14:
+        elif event < 0.14:
             self.call("repeat", self.now)
-        elif what < 0.16:
+        elif event < 0.16:
             self._tell(random_gateway(chance, self.now))
             self.call("gateway_changed", self.now)
-        elif what < 0.24 and self.slots:
+        elif event < 0.24 and self.slots:
             chance.choice(self.slots).act(self.now)
         else:
             self._receive(esc)
         self.call("advance", self.now)
 
     def _receive(self, esc: int) -> None:
-        chance, data = self.chance, self.chance.choice(_streams())
+        chance = self.chance
+        data = self.chance.choice(_streams())
         count = chance.randrange(6) if chance.random() < 0.2 else 0
         cuts = sorted(chance.choices(range(len(data) + 1), k=count))
         for begin, end in zip([0, *cuts], [*cuts, len(data)], strict=True):
             since = self.now - chance.choice((0, 0, 0, MS, 10 * MS, 200 * MS, 2 * SECOND))
-            self.call("receive", esc, data[begin:end], self.now, since)
+            self.call(
+                "receive",
+                esc,
+                data[begin:end],
+                self.now,
+                since,
+            )
             if chance.random() < 0.3:
                 self.now += chance.randrange(3 * MS)
 
@@ -363,11 +463,17 @@ def some_escs(chance: random.Random) -> list[EscSettings]:
     return [settings(chance, n) for n in range(chance.randint(1, 3))]
 
 
-def run(library: Any, seed: int, steps: int = 300, most: int = 8) -> int:
-    """Frames compared; 0 for a layout that the core in C does not take."""
+def run(
+    library: Any,
+    seed: int,
+    steps: int = 300,
+    most: int = 8,
+) -> int:
+    """Return the number of compared frames, or 0 for a layout that the C core cannot express."""
     chance = random.Random(seed)
     escs = some_escs(chance)
     try:
-        return Both(library, chance, escs, layout(chance, escs, most)).run(steps)
+        both = Both(library, chance, escs, layout(chance, escs, most))
+        return both.run(steps)
     except NotInCore:
         return 0

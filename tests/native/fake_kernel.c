@@ -1,4 +1,7 @@
-/* What linux.c asks of the kernel, answered by a test. Compiled with it and with -D macros that give each call its name here. */
+/* System calls of linux.c, answered by a test.
+
+   It is compiled together with linux.c. Macros (-D) replace each call by the function of this
+   file. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <poll.h>
@@ -13,19 +16,19 @@
 
 typedef struct {
     int64_t (*now)(void);
-    void (*wait)(int64_t until, int for_room); /* until something has come; then the process may stand still */
-    int (*look)(int is_all);              /* errno of a poll, of all descriptors or of some */
-    int (*ready)(int fd);                 /* for what */
-    /* How many bytes a read puts into `data`; below 0: -errno; -1: the port has hung up. */
+    void (*wait)(int64_t until, int for_room); /* for an event; a hold-up may follow */
+    int (*look)(int is_all);              /* errno of a poll of all or of some descriptors */
+    int (*ready)(int fd);                 /* events of a descriptor */
+    /* Number of bytes that a read puts into `data`, -errno, or -1 if the port has hung up. */
     int (*size)(int fd, int most);
     int (*send)(const uint8_t *frame, int size); /* errno, or 0 if the bus takes the frame */
-    void (*settings)(int fd, uint8_t *at, int is_set); /* of a port: they are set, or asked for */
+    void (*settings)(int fd, uint8_t *at, int is_set); /* sets or reads the settings of a port */
 } kernel;
 static kernel k;
 uint8_t fake_data[1 << 16];
 static struct { int fd; struct epoll_event e; } watched[64];
 static int count;
-int fake_epolls; /* how many are open */
+int fake_epolls; /* number of open ones */
 
 void fake_use(const kernel *given)
 {

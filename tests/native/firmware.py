@@ -1,4 +1,4 @@
-"""An exported folder at work: its example fed with recorded bytes, and what the core in Python sends for the same."""
+"""Runs the example of an exported folder with bytes, and compares it with the Python core."""
 
 import random
 import subprocess
@@ -24,7 +24,7 @@ SOURCES = ("core.c", "tables.c", "example_main.c")
 
 
 class Case:
-    """A folder with the export of a random layout, and random bytes of its ESCs; of a given layout where there is one."""
+    """A folder with the export of a given or random layout, and random bytes of its ESCs."""
 
     def __init__(
         self,
@@ -57,29 +57,48 @@ class Case:
         return [f"uart{number}.bin" for number in range(len(self.lines))]
 
     def output(self, *command: str) -> str:
-        """What a program prints that runs in the folder. AssertionError with what it said if it failed."""
+        """Run a program in the folder and return its output.
+
+        Raise AssertionError with its error output if it failed.
+        """
         nothing = subprocess.DEVNULL
-        run = partial(subprocess.run, stdin=nothing, capture_output=True, text=True, timeout=300)
+        run = partial(
+            subprocess.run,
+            stdin=nothing,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
         done = run(command, cwd=self.folder, check=False)
         assert done.returncode == 0, done.stderr[:3000]
         return done.stdout
 
     def build(self, compiler: str, *options: str) -> Path:
-        """The example, compiled in the folder."""
+        """Compile the example in the folder. Return its path."""
         target = self.folder / f"example-{Path(compiler).name}"
-        self.output(compiler, "-std=c99", *STRICT, *options, "-o", str(target), *SOURCES)
+        self.output(
+            compiler,
+            "-std=c99",
+            *STRICT,
+            *options,
+            "-o",
+            str(target),
+            *SOURCES,
+        )
         return target
 
     def run(self, *command: str) -> str:
-        """What the example prints."""
+        """Run the example and return its output."""
         return self.output(*command, *self.inputs)
 
     def expected(self) -> str:
-        """The frames of the core in Python, by the same clock, as candump logs them."""
+        """Return the frames of the Python core with the same clock, in the format of candump."""
         core = PythonCore(self.escs, self.layout, 0, self.silent)
-        core.status.state, core.status.can_state = GatewayState.RUNNING, CanState.ERROR_ACTIVE
+        core.status.state = GatewayState.RUNNING
+        core.status.can_state = CanState.ERROR_ACTIVE
         core.repeat(0)
-        taken, empty = [0] * len(self.lines), [0] * len(self.lines)
+        taken = [0] * len(self.lines)
+        empty = [0] * len(self.lines)
         last = max(-(-len(line) * BYTE_NS // MS) * MS for line in self.lines)
         text = []
         for now in range(0, last + SILENCE + 1, MS):
@@ -92,15 +111,16 @@ class Case:
             core.advance(now)
             frames = core.take(now)
             core.status.sent_frames += len(frames)
-            for f in frames:
-                name = f"{f.can_id:08X}" if f.extended else f"{f.can_id:03X}"
-                data = ("#0" if f.fd else "") + f.data.hex().upper()
-                text.append(f"({now // SECOND}.{now % SECOND // 1000:06d}) can0 {name}#{data}\n")
+            seconds, ns = divmod(now, SECOND)
+            for frame in frames:
+                name = f"{frame.can_id:08X}" if frame.extended else f"{frame.can_id:03X}"
+                data = ("#0" if frame.fd else "") + frame.data.hex().upper()
+                text.append(f"({seconds}.{ns // 1000:06d}) can0 {name}#{data}\n")
         return "".join(text)
 
 
 def _line(chance: random.Random) -> bytes:
-    """Telemetry with faults, and stretches of noise in which it becomes stale."""
+    """Return telemetry with faults, and long noise in which values become stale."""
     data = b""
     for _ in range(chance.randint(60, 120)):
         data += equality.stream(chance)

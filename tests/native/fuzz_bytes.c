@@ -1,4 +1,4 @@
-/* A fuzz target for libFuzzer: calls of the core by arbitrary bytes, with the tables of an exported folder. */
+/* A fuzz target for libFuzzer. Arbitrary bytes select calls of the core of an exported folder. */
 #include "core.h"
 #include "tables.h"
 
@@ -7,7 +7,12 @@
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-static const struct { char kind; uint8_t length, covered; } forms[] = {{'L', 38, 32}, {'L', 40, 36}, {'I', 41, 36}, {'I', 44, 40}};
+static const struct { char kind; uint8_t length, covered; } forms[] = {
+    {'L', 38, 32},
+    {'L', 40, 36},
+    {'I', 41, 36},
+    {'I', 44, 40},
+};
 static const uint8_t *at, *end;
 
 static uint32_t next(int bytes)
@@ -18,7 +23,7 @@ static uint32_t next(int bytes)
     return found;
 }
 
-/* A frame with the right CRC, which no fuzzer finds, around the bytes that come next. */
+/* Writes a frame with the next bytes and the right CRC, which a fuzzer cannot find. */
 static size_t frame(uint8_t *f)
 {
     uint32_t form = next(1) % 4;
@@ -122,7 +127,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
             abort();
         send(g, now, next(1));
         for (int i = 0; i < KCG_ESCS; i++)
-            if (g->esc[i].held_count > KCG_HELD)
+            if (g->esc[i].held_count > KCG_MAX_HELD)
                 abort();
     }
     free(memory);

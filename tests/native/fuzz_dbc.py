@@ -1,7 +1,8 @@
-"""Changed DBC text -> layout -> tables -> both cores, which must agree:  fuzz_dbc.py SECONDS SEED CORE
+"""Feeds changed DBC text to both cores, which must agree:  fuzz_dbc.py SECONDS SEED CORE
 
-Random changes without guidance by coverage (libFuzzer cannot see into Python). A DBC is refused by a UserError, or by NotInCore of
-the core in C; anything else is a fault of the seed that was printed last.
+Coverage does not guide the random changes, because libFuzzer cannot measure it in Python. A DBC is
+refused by a UserError, or by NotInCore of the C core. Any other exception is a fault for the seed
+that was printed last.
 """
 
 import logging
@@ -24,10 +25,44 @@ from kontronik_can_gw.native.rows import NotInCore
 
 STEPS = 40
 NUMBERS = (
-    *("0", "1", "-1", "2", "7", "8", "9", "15", "16", "31", "32", "33", "62", "63", "64", "65"),
-    *("255", "256", "511", "512", "65535", "65536", "2147483647", "2147483648", "4294967295"),
-    *("9223372036854775807", "-9223372036854775808", "18446744073709551615"),
-    *("0.1", "-0.5", "1e-9", "1e9", "1e18", "1e300", "0.00592884289493769", "1e-320", "nan", "inf"),
+    "0",
+    "1",
+    "-1",
+    "2",
+    "7",
+    "8",
+    "9",
+    "15",
+    "16",
+    "31",
+    "32",
+    "33",
+    "62",
+    "63",
+    "64",
+    "65",
+    "255",
+    "256",
+    "511",
+    "512",
+    "65535",
+    "65536",
+    "2147483647",
+    "2147483648",
+    "4294967295",
+    "9223372036854775807",
+    "-9223372036854775808",
+    "18446744073709551615",
+    "0.1",
+    "-0.5",
+    "1e-9",
+    "1e9",
+    "1e18",
+    "1e300",
+    "0.00592884289493769",
+    "1e-320",
+    "nan",
+    "inf",
 )
 HERE = Path(__file__).parents[1]
 PATHS = shipped("dbc/kontronik_esc.dbc"), HERE / "dbc/rich.dbc", HERE / "benchmarks/five.dbc"
@@ -35,7 +70,7 @@ FILES = [path.read_text(encoding="latin-1") for path in PATHS]
 
 
 def changed(chance: random.Random, text: str) -> str:
-    """With a number, a line, a sign, a byte order or a character that is another."""
+    """Change a number, a line, a sign, a byte order or a character of the text."""
     for _ in range(chance.choice((1, 1, 2, 3, 8))):
         what = chance.random()
         if what < 0.6:
@@ -44,7 +79,8 @@ def changed(chance: random.Random, text: str) -> str:
             text = text[: one.start()] + chance.choice(NUMBERS) + text[one.end() :]
         elif what < 0.85:
             lines = text.split("\n")
-            at, to = chance.randrange(len(lines)), chance.randrange(len(lines))
+            at = chance.randrange(len(lines))
+            to = chance.randrange(len(lines))
             line = lines[at] if chance.random() < 0.5 else lines.pop(at)
             lines.insert(to, line)
             text = "\n".join(lines)
@@ -61,7 +97,7 @@ def changed(chance: random.Random, text: str) -> str:
 
 
 def one(library: Any, seed: int) -> int:
-    """Frames compared; 0 where the DBC is refused, or for the core in Python alone."""
+    """Return the number of compared frames, or 0 if a core refuses the DBC."""
     chance = random.Random(seed)
     escs = equality.some_escs(chance)
     chosen = DbcConfig()

@@ -1,4 +1,7 @@
-"""Recordings that the core in C plays at full speed beside those that Python plays: the same rows, frames, damage and text."""
+"""Compares recordings played by the C core at full speed with the same played by Python.
+
+Rows, frames, damage and text must be equal.
+"""
 
 import random
 from collections.abc import Iterator, Sequence
@@ -23,8 +26,9 @@ TEXTS = ("csv", "jsonl", "candump")
 
 @contextmanager
 def core(library: Any) -> Iterator[None]:
-    """The shared object that is there; None: there is none."""
-    before, load.library = load.library, lambda: (library, "")  # type: ignore[assignment]
+    """Use this shared object within the block. None means that there is none."""
+    before = load.library
+    load.library = lambda: (library, "")  # type: ignore[assignment]
     try:
         yield
     finally:
@@ -33,14 +37,15 @@ def core(library: Any) -> Iterator[None]:
 
 def esc(chance: random.Random, number: int) -> dict[str, object]:
     gear = f"{chance.randint(1, 300)}/{chance.randint(1, 300)}"
-    timeout, poles = chance.choice((20, 250, 1000)), chance.choice((1, 7, 14, 64, 100))
+    timeout = chance.choice((20, 250, 1000))
+    poles = chance.choice((1, 7, 14, 64, 100))
     cells = chance.choice((0, 0, 6, 14))
     more = {"gear": gear, "cell_count": cells, "telemetry_timeout_ms": timeout}
     return {"name": f"e{number}", "pole_pairs": poles} | more
 
 
 def odd(chance: random.Random, last: Entry) -> Entry:
-    """An entry that comes now and then, or that no recorder writes."""
+    """Return a rare entry, or one that no recorder writes."""
     now = last.time_ns
     number = chance.randrange(1 << chance.choice((40, 40, 50, 64))).to_bytes(8, "little")
     noise = equality.stream(chance)
@@ -64,7 +69,7 @@ def odd(chance: random.Random, last: Entry) -> Entry:
 
 
 def write_capture(chance: random.Random, path: Path, version: int = 2) -> Path:
-    """A capture in which everything happens; in part damaged."""
+    """Write a capture in which everything occurs. A part may be damaged."""
     nodes = chance.random() < 0.4
     bench = Bench(*made(chance.randint(1, 3), nodes, lambda number: esc(chance, number)))
     bench.live(chance.randrange(1000), 6)
@@ -78,12 +83,13 @@ def write_capture(chance: random.Random, path: Path, version: int = 2) -> Path:
     blocks = [block(b"H", 0, json_payload(header))]
     while entries:
         count = chance.choice((1, 2, 40, 400))
-        some, entries = entries[:count], entries[count:]
+        some = entries[:count]
+        entries = entries[count:]
         payload = data_payload(some)
         if version == 1:
             payload = data_payload([e._replace(came_ns=e.time_ns) for e in some])
         if chance.random() < 0.02:
-            payload = payload[:-1]  # its table says otherwise
+            payload = payload[:-1]  # contradicts its table
         blocks.append(block(b"D", len(blocks), payload))
     if chance.random() < 0.5:
         blocks[chance.randrange(1, len(blocks))] = b"damaged"
@@ -92,7 +98,7 @@ def write_capture(chance: random.Random, path: Path, version: int = 2) -> Path:
 
 
 def write_bytes(chance: random.Random, path: Path) -> Path:
-    """Plain bytes; in part damaged."""
+    """Write plain bytes. A part may be damaged."""
     data = b"".join(equality.stream(chance) for _ in range(chance.choice((1, 30, 300))))
     if chance.random() < 0.5:
         data += bytes(chance.choice(b"KODLI\0\xff") for _ in range(chance.choice((5, 100_000))))
@@ -101,7 +107,7 @@ def write_bytes(chance: random.Random, path: Path) -> Path:
 
 
 def read(recording: Input, chosen: Sequence[int]) -> list[Any]:
-    """All of a recording."""
+    """Return rows, frames and damage of a recording."""
     rows = [(row.time_ns, row.values) for row in recording.samples(chosen)]
     found = [rows, list(recording.damage)]
     frames = list(recording.frames())
@@ -109,24 +115,29 @@ def read(recording: Input, chosen: Sequence[int]) -> list[Any]:
 
 
 def converted(recording: Input, choice: Choice, form: str, path: Path) -> Any:
-    """The file of a conversion, and what is said of it."""
+    """Convert a recording. Return the result of the conversion and the content of its file."""
     with Output(path) as out:
         if form in TABLES:
-            said = to_table(recording, out, form, choice)
+            result = to_table(recording, out, form, choice)
         else:
-            said = to_log(recording, out, form, choice.start_ns, choice.end_ns)
-    return said, path.read_bytes() if path.exists() else b""
+            result = to_log(recording, out, form, choice.start_ns, choice.end_ns)
+    content = path.read_bytes() if path.exists() else b""
+    return result, content
 
 
 def run(library: Any, seed: int, folder: Path) -> int:
-    """Rows and frames compared."""
+    """Compare a random recording. Return the number of rows and frames."""
     chance = random.Random(seed)
     write = write_capture if chance.random() < 0.6 else write_bytes
     path = write(chance, folder / f"{seed}.kcap")
-    path = path if write is write_capture else path.rename(path.with_suffix(".bin"))
+    if write is write_bytes:
+        path = path.rename(path.with_suffix(".bin"))
     setattr(bytes_input, "CHUNK", chance.choice((7, 100, 5000, 1 << 18)))  # noqa: B010
     found = []
-    part = {"start_ns": chance.choice((None, SECOND)), "end_ns": chance.choice((None, 3 * SECOND))}
+    part = {
+        "start_ns": chance.choice((None, SECOND)),
+        "end_ns": chance.choice((None, 3 * SECOND)),
+    }
     fields = range(len(open_input(path).fields))
     chosen = chance.choice((fields, chance.sample(fields, 20)))
     for which in (None, library):
@@ -135,10 +146,10 @@ def run(library: Any, seed: int, folder: Path) -> int:
             played = all(isinstance(block, PlayedBlock) for block in recording.blocks())
             assert played is (which is not None)
             read_once = read(recording, chosen)
-            files = [
-                converted(recording, Choice(chosen, **part), form, folder / f"{seed}.{form}")
-                for form in TEXTS
-            ]
+            files = []
+            choice = Choice(chosen, **part)
+            for form in TEXTS:
+                files.append(converted(recording, choice, form, folder / f"{seed}.{form}"))
             recording.close()
         found.append([*read_once, files])
     for python, native in zip(*found, strict=True):
@@ -149,7 +160,8 @@ def run(library: Any, seed: int, folder: Path) -> int:
 def _difference(*sides: Any) -> str:
     if not all(isinstance(side, list) for side in sides):
         return f"{sides}"
-    length = [len(side) for side in sides]
-    pairs = enumerate(zip(*sides, strict=False))
-    place, pair = next(((n, p) for n, p in pairs if p[0] != p[1]), (min(length), ()))
-    return f"{place} of {length}: {str(pair)[:3000]}"
+    lengths = [len(side) for side in sides]
+    for place, pair in enumerate(zip(*sides, strict=False)):
+        if pair[0] != pair[1]:
+            return f"{place} of {lengths}: {str(pair)[:3000]}"
+    return f"{min(lengths)} of {lengths}"

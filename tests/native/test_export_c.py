@@ -1,4 +1,4 @@
-"""What `export c` writes compiles by itself, without a warning, and sends what the core in Python sends."""
+"""The files of `export c` compile alone without a warning, and send the Python core's frames."""
 
 import re
 import subprocess
@@ -20,7 +20,7 @@ from kontronik_can_gw.native.export_c import exported
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_its_frames_are_those_of_the_core_in_python(tmp_path: Path, seed: int) -> None:
+def test_an_export_sends_the_frames_of_the_python_core(tmp_path: Path, seed: int) -> None:
     case = Case(tmp_path, seed)
     sent = case.run(str(case.build(there("gcc"), "-O1")))
     assert sent.count("\n") > 100
@@ -36,15 +36,17 @@ def test_its_frames_are_those_of_the_core_in_python(tmp_path: Path, seed: int) -
         "-DKCG_DATA=64 -DKCG_FLOATS=1",
     ],
 )
-def test_macros_build_without_a_warning(tmp_path: Path, program: str, options: str) -> None:
+def test_all_macros_compile_without_a_warning(tmp_path: Path, program: str, options: str) -> None:
     bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
     Case(tmp_path, 1, bus.layout, bus.escs).build(there(program), "-Os", *options.split())
 
 
-def test_the_command_writes_what_a_configuration_sends(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_command_exports_the_messages_of_a_configuration(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    config, folder = tmp_path / "gateway.toml", tmp_path / "firmware"
+    config = tmp_path / "gateway.toml"
+    folder = tmp_path / "firmware"
     config.write_text(
         '[can]\nchannel = "vcan0"\n[canopen]\nenabled = true\n'
         '[[esc]]\nname = "left"\nport = "/dev/null"\npole_pairs = 7\n'
@@ -56,12 +58,11 @@ def test_the_command_writes_what_a_configuration_sends(
     assert "enum { KCG_ESC_left, KCG_ESC_rear, KCG_ESCS };" in header
     ids = re.findall(r"#define KCG_ID_(\w+) 0x(\w+)u\n#define KCG_LENGTH_\1 (\d+)", header)
     assert len(ids) == header.count("KCG_MESSAGE_") > 20
-    assert re.search(
-        r"\.poles = 7,.*\n.*\.gear_numerator = 5, \.gear_denominator = 2",
-        (folder / "tables.c").read_text(),
-    )
+    settings = r"\.poles = 7,.*\n.*\.gear_numerator = 5, \.gear_denominator = 2"
+    assert re.search(settings, (folder / "tables.c").read_text())
     page = (folder / "README.md").read_text()
-    assert "left, rear" in page and "Permission is hereby granted" in page
+    assert "left, rear" in page
+    assert "Permission is hereby granted" in page
 
     own = folder / "example_main.c"
     own.write_text("int main(void) { return 0; }\n")
@@ -72,20 +73,21 @@ def test_the_command_writes_what_a_configuration_sends(
     assert (folder / "tables.h").read_text() == header
 
 
-def test_files_that_exist_are_only_replaced_with_force(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_existing_files_are_only_replaced_with_force(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "README.md").write_text("# My firmware\n")
     assert main(["export", "c", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.endswith(
-        "README.md: exists. Give another name, or --force to replace it.\n"
-    )
+    expected = "README.md: exists. Give another name, or --force to replace it.\n"
+    assert capsys.readouterr().err.endswith(expected)
     assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
     assert main(["export", "c", str(tmp_path / "README.md")]) == 1
 
 
-def test_what_the_core_cannot_express_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_signal_that_the_core_cannot_express_is_refused(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     dbc = tmp_path / "big.dbc"
     dbc.write_text(
@@ -93,14 +95,12 @@ def test_what_the_core_cannot_express_is_refused(
         ' SG_ LinkState : 0|32@1+ (0.00592884289493769,89.21540281025877) [0|0] "" Car\n'
     )
     assert main(["export", "c", "--dbc", str(dbc), str(tmp_path / "out")]) == 2
-    assert (
-        "not in the core in C: M.LinkState: factor 0.00592884289493769 leaves 64 bits. Factor"
-        in capsys.readouterr().err
-    )
+    reason = "M.LinkState: factor 0.00592884289493769 leaves 64 bits. Factor"
+    assert f"not in the core in C: {reason}" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_names_end_no_comment_and_are_never_the_same() -> None:
+def test_names_never_end_a_comment_and_are_unique() -> None:
     bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
     names = "a*/b", "a  b", "é\n", "COUNT"
     layout = replace(bus.layout, file='/x/*/"\\\n.dbc')
@@ -119,7 +119,9 @@ int main()
     kcg *core = kcg_init(memory, &kcg_tables, kcg_esc_settings, 5);
     kcg_frame frames[4];
     kcg_repeat(core, 5);
-    return kcg_next_deadline(core) < 5 || kcg_take(core, 5, frames, 4) > 4 || kcg_size(&kcg_tables) != KCG_MEMORY;
+    if (kcg_next_deadline(core) < 5 || kcg_take(core, 5, frames, 4) > 4)
+        return 1;
+    return kcg_size(&kcg_tables) != KCG_MEMORY;
 }
 """
 
@@ -130,33 +132,63 @@ def shipped_case(tmp_path: Path) -> Case:
     return Case(tmp_path, 1, bus.layout, bus.escs)
 
 
-def test_it_links_with_a_program_in_cpp(shipped_case: Case) -> None:
+def test_an_export_links_with_a_cpp_program(shipped_case: Case) -> None:
     case = shipped_case
     (case.folder / "main.cpp").write_text(_FROM_CPP)
     case.output(there("gcc"), "-std=c99", "-c", "core.c", "tables.c")
-    case.output(there("g++"), "-Wall", "-Werror", "-o", "cpp", "main.cpp", "core.o", "tables.o")
+    case.output(
+        there("g++"),
+        "-Wall",
+        "-Werror",
+        "-o",
+        "cpp",
+        "main.cpp",
+        "core.o",
+        "tables.o",
+    )
     assert case.output("./cpp") == ""
 
 
 @pytest.mark.parametrize("option", ["-DKCG_DATA=64", "-DKCG_FOUND=3"])
 def test_files_that_differ_in_a_structure_do_not_link(shipped_case: Case, option: str) -> None:
-    """The program would write beyond memory that the other file has reserved."""
-    case, gcc = shipped_case, there("gcc")
+    """Otherwise the program would write beyond the memory that the other file reserves."""
+    case = shipped_case
+    gcc = there("gcc")
     case.output(gcc, "-std=c99", option, "-c", "core.c")
     words = [gcc, "-std=c99", "-o", "differs", "core.o", "tables.c", "example_main.c"]
-    done = subprocess.run(words, cwd=case.folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words,
+        cwd=case.folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode != 0
     for name in ("kcg_init", "kcg_take"):
-        assert re.search(
-            rf"undefined reference to .{name}_with_KCG_DATA_8_KCG_FOUND_2", done.stderr
-        )
-    case.output(*words[:2], option, "-o", "same", "core.o", "tables.c", "example_main.c")
+        expected = rf"undefined reference to .{name}_with_KCG_DATA_8_KCG_FOUND_2"
+        assert re.search(expected, done.stderr)
+    case.output(
+        *words[:2],
+        option,
+        "-o",
+        "same",
+        "core.o",
+        "tables.c",
+        "example_main.c",
+    )
 
 
-@pytest.mark.parametrize(("option", "count"), [("-DKCG_SLOTS=0", 0), ("-DKCG_SLOTS=1", 8)])
-def test_what_is_declared_is_defined(shipped_case: Case, option: str, count: int) -> None:
-    """Every function of core.h that the preprocessor leaves is defined in core.c, and the slots only with KCG_SLOTS."""
-    case, gcc = shipped_case, there("gcc")
+@pytest.mark.parametrize(
+    ("option", "count"),
+    [
+        ("-DKCG_SLOTS=0", 0),
+        ("-DKCG_SLOTS=1", 8),
+    ],
+)
+def test_every_declared_function_is_defined(shipped_case: Case, option: str, count: int) -> None:
+    """core.c defines every function that core.h declares. Slots need KCG_SLOTS."""
+    case = shipped_case
+    gcc = there("gcc")
     header = case.output(gcc, "-std=c99", option, "-E", "-P", "core.h")
     declared = set(re.findall(r"(kcg_\w+)\([^;{}]*\);", header))
     case.output(gcc, "-std=c99", option, "-c", "core.c")
@@ -178,7 +210,9 @@ static void feed(const uint8_t *data, size_t size, int ms)
 }
 static void say(const char *text)
 {
-    printf("%s %lld %lld\\n", text, (long long)core->esc[0].link, (long long)core->gateway[KCG_BUS_OFF_COUNT]);
+    long long link = core->esc[0].link;
+    long long bus_off_count = core->gateway[KCG_BUS_OFF_COUNT];
+    printf("%s %lld %lld\\n", text, link, bus_off_count);
 }
 int main(void)
 {
@@ -203,21 +237,36 @@ int main(void)
     return 0;
 }
 """
-OK, LOST, PORT_ERROR = LinkState.OK, LinkState.LOST, LinkState.PORT_ERROR
+OK = LinkState.OK
+LOST = LinkState.LOST
+PORT_ERROR = LinkState.PORT_ERROR
 
 
 def test_the_example_survives_a_failed_uart_and_bus_off(shipped_case: Case) -> None:
-    case, live = shipped_case, encode(LiveData(battery_voltage=2400), WireLayout.V4)
+    case = shipped_case
+    live = encode(LiveData(battery_voltage=2400), WireLayout.V4)
     text = _FAULTS.replace("LIVE", ", ".join(map(str, live)))
     (case.folder / "faults.c").write_text(text)
-    case.output(there("gcc"), "-std=c99", *STRICT, "-o", "faults", "core.c", "tables.c", "faults.c")
-    blocks, states, frames = {}, {}, []
+    case.output(
+        there("gcc"),
+        "-std=c99",
+        *STRICT,
+        "-o",
+        "faults",
+        "core.c",
+        "tables.c",
+        "faults.c",
+    )
+    blocks = {}
+    states = {}
+    frames = []
     for line in case.output("./faults").splitlines():
         if line.startswith("("):
             frames.append(line.split()[2].partition("#")[0])
         else:
             name, link, count = line.split()
-            blocks[name], states[name] = frames, (int(link), int(count))
+            blocks[name] = frames
+            states[name] = (int(link), int(count))
             frames = []
     assert states == {
         "ok": (OK, 0),
@@ -228,10 +277,7 @@ def test_the_example_survives_a_failed_uart_and_bus_off(shipped_case: Case) -> N
         "on": (OK, 1),
     }
     assert blocks["off"] == [], "nothing is sent in bus-off"
-    without_cycle = {
-        f"{m.can_id:03X}"
-        for m in layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout.messages
-        if not m.cycle_ns
-    }
-    assert set(blocks["on"]) >= without_cycle, "all are sent once more"
+    messages = layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout.messages
+    without_cycle = {f"{each.can_id:03X}" for each in messages if not each.cycle_ns}
+    assert set(blocks["on"]) >= without_cycle, "all are sent again"
     assert len(set(blocks["on"])) == len(blocks["on"])

@@ -1,4 +1,7 @@
-"""The core under fuzzers, with sanitizers: 30 s each here, ten minutes each in `make release` (KCG_FUZZ_SECONDS)."""
+"""The core under fuzzers with sanitizers.
+
+Each fuzzer runs for 30 s here, and for ten minutes in `make release` (KCG_FUZZ_SECONDS).
+"""
 
 import os
 import random
@@ -12,16 +15,19 @@ from firmware import Case
 
 SECONDS = int(os.environ.get("KCG_FUZZ_SECONDS", "30"))
 SEED = random.Random().randrange(1 << 30) if SECONDS > 30 else 1
-"""Always the same in CI."""
+"""Seed of the fuzzers. It is always the same in CI."""
 HERE = Path(__file__).parent
 FUZZED = (1, 2, 5)
-"""Seeds of layouts."""
+"""Seeds of the layouts."""
 pytestmark = pytest.mark.extended
 
 
 @pytest.mark.parametrize("layout", FUZZED)
-def test_bytes_and_times(tmp_path: Path, layout: int) -> None:
-    """Any calls, by libFuzzer: nothing outside its memory, nothing undefined, no deadline that does not move on."""
+def test_any_bytes_and_times_do_no_harm(tmp_path: Path, layout: int) -> None:
+    """libFuzzer makes any calls.
+
+    The core stays in its memory, has no undefined behaviour, and its deadlines advance.
+    """
     case = Case(tmp_path / "export", layout)
     corpus = tmp_path / "corpus"
     corpus.mkdir()
@@ -40,12 +46,18 @@ def test_bytes_and_times(tmp_path: Path, layout: int) -> None:
     subprocess.run([*command, "-o", str(program), *sources], check=True)
     limits = f"-max_total_time={max(1, SECONDS // len(FUZZED))}", f"-seed={SEED}", "-max_len=4096"
     words = [str(program), *limits, "-timeout=10", "-print_final_stats=1", str(corpus)]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr[-6000:]
     print(done.stderr[-600:])
 
 
-def test_dbc_text(tmp_path: Path) -> None:
-    """Changed DBC text: refused in words, or both cores agree."""
+def test_any_dbc_text_is_refused_or_read_equally(tmp_path: Path) -> None:
+    """Changed DBC text is refused with a message, or both cores agree."""
     printed = run_sanitized(tmp_path, str(HERE / "fuzz_dbc.py"), str(SECONDS), str(SEED))
     print(printed.splitlines()[-1])

@@ -1,4 +1,7 @@
-"""pip installs a gateway that works, with a C compiler, without one, and with one that fails; it says which core runs and why."""
+"""pip installs a working gateway with a C compiler, without one, and with one that fails.
+
+The gateway logs which core runs and why.
+"""
 
 import os
 import shutil
@@ -23,7 +26,7 @@ pytestmark = pytest.mark.extended
 
 @pytest.fixture
 def sources(tmp_path: Path) -> Path:
-    """A copy of what a source distribution holds: an installation writes in there."""
+    """Return a copy of the source distribution, because an installation writes into it."""
     made = tmp_path / "sources"
     made.mkdir()
     for name in FILES:
@@ -35,19 +38,26 @@ def sources(tmp_path: Path) -> Path:
 
 
 def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str, str]:
-    """The program in a fresh environment, the name of its wheel, and what pip printed."""
-    folder, wheels = sources.parent / "fresh", sources.parent / "wheels"
+    """Install in a new environment. Return the program, the name of its wheel and pip's output."""
+    folder = sources.parent / "fresh"
+    wheels = sources.parent / "wheels"
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     build = ["wheel", "-v", "--no-deps", "--no-build-isolation", "-w", str(wheels), str(sources)]
     command = [*pip, *build]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     (wheel,) = wheels.iterdir()
     venv.create(folder, symlinks=True)
     into = ["--python", f"{folder}/bin/python", "install", "-q", "--no-deps", "--no-index"]
     subprocess.run([*pip, *into, str(wheel)], check=True)
     (packages,) = folder.glob("lib/python*/site-packages")
-    # what it depends on is that of the tests
+    # The dependencies are taken from the environment of the tests.
     (packages / "others.pth").write_text(sysconfig.get_path("purelib"))
     return folder / "bin" / "kontronik-can-gw", wheel.name, done.stdout + done.stderr
 
@@ -57,14 +67,20 @@ def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str,
     [
         (None, ""),
         ("", "there was no C compiler at the installation"),
-        ("echo 'cc: error: broken' >&2\nexit 1\n", "at the installation {} failed: cc: error: broken"),
+        (
+            "echo 'cc: error: broken' >&2\nexit 1\n",
+            "at the installation {} failed: cc: error: broken",
+        ),
     ],
     ids=["with a compiler", "without one", "with one that fails"],
-)  # fmt: skip
-def test_the_gateway_works_and_says_which_core_runs_and_why(
-    sources: Path, compiles: str | None, why: str
+)
+def test_an_installed_gateway_works_and_logs_which_core_runs_and_why(
+    sources: Path,
+    compiles: str | None,
+    why: str,
 ) -> None:
-    programs, environment = sources.parent / "programs", dict(os.environ)
+    programs = sources.parent / "programs"
+    environment = dict(os.environ)
     programs.mkdir()
     if compiles is None and compiler() is None:
         pytest.skip("no C compiler: sudo apt-get install gcc libc6-dev")
@@ -82,8 +98,9 @@ def test_the_gateway_works_and_says_which_core_runs_and_why(
     command = [str(program), "run", "--wait", "-c", str(config)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd="/") as process:
         assert process.stderr is not None
-        said = next((line for line in process.stderr if "core: " in line), "")
+        found = next((line for line in process.stderr if "core: " in line), "")
         process.terminate()
         process.stderr.read()
     assert process.returncode == 0
-    assert said.strip().partition("core: ")[2] == (f"Python ({why})" if why else "C")
+    expected = f"Python ({why})" if why else "C"
+    assert found.strip().partition("core: ")[2] == expected

@@ -1,4 +1,4 @@
-"""The core in C plays recordings at full speed and gives what Python gives, from the file to the text."""
+"""The C core plays recordings at full speed, and gives the same results as Python."""
 
 import random
 from pathlib import Path
@@ -15,13 +15,15 @@ from kontronik_can_gw.desk.recordings.recording import PlayedBlock
 
 @pytest.fixture(autouse=True)
 def reads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a run changes is as it was after it."""
+    """Restore after each test the setting that a run changes."""
     monkeypatch.setattr(bytes_input, "CHUNK", 0)
 
 
 @pytest.mark.parametrize("group", range(4))
-def test_rows_frames_damage_and_text_are_those_of_python(
-    native_library: Any, tmp_path: Path, group: int
+def test_rows_frames_damage_and_text_equal_those_of_python(
+    native_library: Any,
+    tmp_path: Path,
+    group: int,
 ) -> None:
     counts = [offline_equality.run(native_library, seed, tmp_path) for seed in range(group, 12, 4)]
     assert sum(counts) > 200
@@ -29,15 +31,20 @@ def test_rows_frames_damage_and_text_are_those_of_python(
 
 @pytest.mark.extended
 @pytest.mark.parametrize("group", range(10))
-def test_the_same_over_many_more_recordings(
-    native_library: Any, tmp_path: Path, group: int
+def test_many_more_recordings_equal_those_of_python(
+    native_library: Any,
+    tmp_path: Path,
+    group: int,
 ) -> None:
     seeds = range(1_000 + group, 1_040, 10)
     assert sum(offline_equality.run(native_library, seed, tmp_path) for seed in seeds) > 200
 
 
-def test_what_it_does_not_play_python_plays(native_library: Any, tmp_path: Path) -> None:
-    """Captures of 0.5.0, and the frames of CANopen nodes; their rows are played in C."""
+def test_recordings_that_c_cannot_play_are_played_by_python(
+    native_library: Any,
+    tmp_path: Path,
+) -> None:
+    """These are captures of 0.5.0, and the frames of CANopen nodes. C plays the rows of nodes."""
     bench = Bench(*made(2, canopen=True)).live(3, 2)
     nodes = capture(tmp_path / "nodes.kcap", bench.setup, bench.entries)
     old = offline_equality.write_capture(random.Random(1), tmp_path / "old.kcap", version=1)

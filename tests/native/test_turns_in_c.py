@@ -1,4 +1,7 @@
-"""A loop that turns in C, with a kernel that is played: what it records, replayed by the core in Python, gives what it sent."""
+"""A loop that turns in C, with a simulated kernel.
+
+A replay of its recording by the Python core gives the frames that it sent.
+"""
 
 import ctypes as c
 import random
@@ -44,7 +47,7 @@ from kontronik_can_gw.times import MS, SECOND
 
 
 def _nodes(escs: Sequence[EscSettings]) -> CanopenSetup:
-    """Self-starting ones with default PDOs."""
+    """Return a self-starting node with default PDOs for each ESC."""
     count = len(escs)
     settings = tuple(NodeSettings(1 + n, self_start=True) for n in range(count))
     return CanopenSetup(shipped_eds(), settings, (Stored(),) * count, tuple(escs))
@@ -56,7 +59,7 @@ pytestmark = pytest.mark.parametrize("core_language", ["C"], indirect=True)
 
 
 class InC:
-    """A loop that turns in C, in a played world. ``turns``: when the loop itself turned."""
+    """A loop that turns in C, in a World. ``turns`` has the times of turns in Python."""
 
     def __init__(
         self,
@@ -67,20 +70,21 @@ class InC:
     ) -> None:
         self.world = world = wire_world.World(len(escs))
         self.loop = wire_world.loop_in(world, patch, escs, layout, **more)
-        self.bus, self.begun = world.bus, world.now
+        self.bus = world.bus
+        self.begun = world.now
         self.turns: list[int] = []
         _count(patch, self.loop, "_serve", lambda: self.turns.append(world.now))
         self.loop.open()
         self.loop.begin()
 
     def feed(self, frames: Iterable[LiveData]) -> None:
-        """Each 10 ms one, from the beginning on."""
+        """Send one frame every 10 ms, beginning at the start."""
         for n, data in enumerate(frames):
             wire = encode(data, WireLayout.V4)
             self.world.wires[0].put(wire, [self.begun + n * 10 * MS] * len(wire))
 
     def run(self, seconds: float) -> None:
-        """Until so long after the beginning."""
+        """Run until this time after the start."""
         wire_world.run(self.loop, self.world, self.begun + round(seconds * SECOND))
 
     def fill_bus(self, frame_ns: int) -> None:
@@ -89,8 +93,13 @@ class InC:
             pass
 
 
-def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], None]) -> None:
-    """``note`` is called before each call of a method."""
+def _count(
+    patch: pytest.MonkeyPatch,
+    of: object,
+    name: str,
+    note: Callable[[], None],
+) -> None:
+    """Call ``note`` before each call of a method."""
     method = getattr(of, name)
 
     def noted(*arguments: Any) -> Any:
@@ -101,9 +110,17 @@ def _count(patch: pytest.MonkeyPatch, of: object, name: str, note: Callable[[], 
 
 
 class Recorded(InC):
-    """One that is recorded, with random ESCs, layout and bytes. ``has_nodes``: each ESC has a CANopen node, all one of DroneCAN."""
+    """A recorded loop with random ESCs, layout and bytes.
 
-    def __init__(self, seed: int, patch: pytest.MonkeyPatch, has_nodes: bool = False) -> None:
+    With ``has_nodes`` each ESC has a CANopen node, and all ESCs share a DroneCAN node.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        patch: pytest.MonkeyPatch,
+        has_nodes: bool = False,
+    ) -> None:
         chance = random.Random(seed)
         self.entries: list[Entry] = []
         self.escs = [settings(chance, n) for n in range(chance.randint(1, 4))]
@@ -119,19 +136,25 @@ class Recorded(InC):
             at = self.begun
             while at < self.begun + 2 * SECOND:
                 data = stream(chance)
-                # handed over at once, or as on the wire
+                # The bytes arrive at once, or as on the wire.
                 step = chance.choice((0, wire_world.NS_PER_BYTE))
                 wire.put(data, [at + n * step for n in range(1, len(data) + 1)])
                 at += len(data) * wire_world.NS_PER_BYTE
                 at += chance.choice((0, MS, 6 * MS, 6 * MS, 6 * MS, 300 * MS))
 
     def _put(
-        self, now: int, kind: int, esc: int, data: bytes, flags: int, came: int | None = None
+        self,
+        now: int,
+        kind: int,
+        esc: int,
+        data: bytes,
+        flags: int,
+        came: int | None = None,
     ) -> None:
         self.entries.append(Entry(now, Kind(kind), esc, data, flags, came))
 
     def sent(self) -> list[tuple[int, bytes]]:
-        """What the bus took, to the end."""
+        """Run to the end. Return the frames that were sent."""
         self.run(2.5)
         self.loop.end()
         assert len(self.bus.sent) == self.status.sent_frames
@@ -153,26 +176,33 @@ def on_the_wire(frames: Iterable[CanFrame]) -> list[tuple[int, bytes]]:
 
 @pytest.mark.parametrize("has_nodes", [False, True])
 @pytest.mark.parametrize("seed", range(6))
-def test_what_is_sent_is_what_a_replay_in_python_sends(
-    seed: int, has_nodes: bool, monkeypatch: pytest.MonkeyPatch
+def test_sent_frames_equal_those_of_a_replay_in_python(
+    seed: int,
+    has_nodes: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The order included: outputs' frames, then slots, then messages. With nodes nearly each frame has other error bits."""
+    """The order is the same: frames of outputs, then slots, then messages.
+
+    With nodes the error bits change in nearly each frame.
+    """
     it = Recorded(seed, monkeypatch, has_nodes)
-    sent, replayed = it.sent(), it.replayed(monkeypatch)
+    sent = it.sent()
+    replayed = it.replayed(monkeypatch)
     assert it.loop._poller.count > 100 > len(it.turns)  # type: ignore[attr-defined]
     assert len(sent) == len(replayed) > 0
     assert sent == replayed
-    emergencies = sum(EMERGENCY < number < EMERGENCY + 5 for number, _ in replayed)
+    ids = [number for number, _ in replayed]
+    emergencies = sum(EMERGENCY < number < EMERGENCY + 5 for number in ids)
     assert (emergencies > 100) == has_nodes
-    assert (sum(number == 0x98040A2A for number, _ in replayed) > 20) == has_nodes
+    assert (ids.count(0x98040A2A) > 20) == has_nodes
 
 
-def test_syncs_read_at_once_are_all_answered_in_the_run_and_in_its_replay(
+def test_syncs_read_at_once_are_all_answered_live_and_in_a_replay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     it = Recorded(1, monkeypatch, has_nodes=True)
     for at, can_id, data in (
-        (100, 0x601, "23 00 18 01 81 01 00 c0"),  # 1800h:1: off
+        (100, 0x601, "23 00 18 01 81 01 00 c0"),  # 1800h:1: invalid
         (110, 0x601, "2f 00 18 02 02 00 00 00"),  # every second SYNC
         (120, 0x601, "2f 00 1a 00 00 00 00 00"),
         (130, 0x601, "23 00 1a 01 08 02 20 20"),  # the live counter
@@ -180,33 +210,41 @@ def test_syncs_read_at_once_are_all_answered_in_the_run_and_in_its_replay(
         (150, 0x601, "23 00 18 01 81 01 00 40"),
         *[(1000, 0x80, "")] * 8,
         *[(1500, 0x80, "")] * 3,
-        *[(1800, 0x80, "")],
+        (1800, 0x80, ""),
     ):
         it.bus.came(can_id, bytes.fromhex(data), it.begun + at * MS)
-    sent, replayed = it.sent(), it.replayed(monkeypatch)
-    pdos = [(number, data) for number, data in sent if number == 0x181 and len(data) == 1]
+
+    def one_byte_pdos(frames: list[tuple[int, bytes]]) -> list[bytes]:
+        return [data for number, data in frames if number == 0x181 and len(data) == 1]
+
+    pdos = one_byte_pdos(it.sent())
     assert len(pdos) == 6
-    assert pdos == [
-        (number, data) for number, data in replayed if number == 0x181 and len(data) == 1
-    ]
+    assert pdos == one_byte_pdos(it.replayed(monkeypatch))
 
 
 @pytest.mark.parametrize("has_nodes", [True, False])
-def test_other_error_bits_are_followed_between_turns_in_c_and_only_where_somebody_wants_it(
-    has_nodes: bool, monkeypatch: pytest.MonkeyPatch
+def test_changed_error_bits_interrupt_turns_in_c_only_if_needed(
+    has_nodes: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The loop comes round for housekeeping, and heartbeats; an emergency goes in front of what the core sends in its turn."""
+    """The loop turns in Python only for housekeeping and heartbeats.
+
+    An emergency is sent before the core's frames of the same turn.
+    """
     it = InC(monkeypatch, outputs=[_nodes(ESCS)] if has_nodes else [])
     poller: Any = it.loop._poller
     events: list[int] = []
-    _count(monkeypatch, poller, "_follow", lambda: events.append(poller._turns.state.found))
+    _count(monkeypatch, poller, "_follow", lambda: events.append(poller._turns.result.event))
     it.feed(LiveData(operating_errors=n // 2 % 2 << 20) for n in range(400))
     it.run(4)
     assert len(it.turns) < 4 * 4
     states = [found for found in events if found & Event.STATE]
     emergencies = [(at, f) for at, f in it.bus.sent if f.can_id == EMERGENCY + 1]
     assert len(emergencies) == (199 if has_nodes else 0)
-    assert (len(states) > 150) if has_nodes else not states
+    if has_nodes:
+        assert len(states) > 150
+    else:
+        assert not states
     for at, _ in emergencies:
         together = [frame.can_id for when, frame in it.bus.sent if when == at]
         assert together[0] in (EMERGENCY + 1, HEARTBEAT + 1)
@@ -215,7 +253,10 @@ def test_other_error_bits_are_followed_between_turns_in_c_and_only_where_somebod
 
 
 class Beacon(Output):
-    """A measurement of its own each 20 ms: the newest wins, unless it is ``queued``."""
+    """An output that sends a measurement every 20 ms.
+
+    A newer one replaces a waiting one, unless it is ``queued``.
+    """
 
     events = Event.NONE
 
@@ -231,14 +272,19 @@ class Beacon(Output):
         if now >= self.due:
             self.due = now + 20 * MS
             self.count += 1
-            self.frames.append(CanFrame(0x700, struct.pack("<I", self.count), queued=self._queued))
+            data = struct.pack("<I", self.count)
+            self.frames.append(CanFrame(0x700, data, queued=self._queued))
 
 
 @pytest.mark.parametrize("queued", [True, False])
-def test_an_output_whose_time_has_come_speaks_between_turns_in_c(
-    queued: bool, monkeypatch: pytest.MonkeyPatch
+def test_an_output_that_is_due_sends_between_turns_in_c(
+    queued: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With telemetry and without; on a full bus what is queued waits, of what is not the newest alone."""
+    """It does so with and without telemetry.
+
+    On a full bus all queued frames wait, but only the newest one that is not queued.
+    """
     beacon = Beacon(queued)
     it = InC(monkeypatch, outputs=[ReadyOutput(beacon)])
     it.feed(LiveData(consumed_charge=n) for n in range(300))
@@ -251,24 +297,29 @@ def test_an_output_whose_time_has_come_speaks_between_turns_in_c(
     it.run(5.5)
     waiting = [f for f in it.loop.can.transmitter.queue.in_order() if f.can_id == 0x700]
     assert waiting[-1].data == struct.pack("<I", beacon.count)
-    assert len(waiting) > 10 if queued else len(waiting) == 1
+    if queued:
+        assert len(waiting) > 10
+    else:
+        assert len(waiting) == 1
     it.loop.close()
 
 
-def test_an_emergency_that_meets_a_full_bus_long_after_the_last_frame_waits_and_is_sent(
+def test_an_emergency_on_a_full_bus_after_a_long_pause_is_sent_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """That the bus took nothing counts from then on: it is no stall, and nothing is lost."""
+    """The time without a sent frame counts only from then. It is not a stall and not a loss."""
     it = InC(monkeypatch, Layout("", "", ()), outputs=[_nodes(ESCS)])
     it.feed(LiveData(operating_errors=(n >= 530) << 20) for n in range(600))
     it.run(1)
     assert 0x181 in dict(it.bus.take())
-    it.bus.came(0, b"\x80\x01")  # pre-operational: heartbeats and emergencies remain
+    it.bus.came(0, b"\x80\x01")  # pre-operational: only heartbeats and emergencies are sent
     it.run(5.295)  # between two heartbeats
     it.fill_bus(30 * MS)
     it.run(6)
-    status, transmitter = it.loop.gateway.status, it.loop.can.transmitter
-    assert (transmitter.is_stalled, status.dropped_frames) == (False, 0)
+    status = it.loop.gateway.status
+    transmitter = it.loop.can.transmitter
+    assert not transmitter.is_stalled
+    assert status.dropped_frames == 0
     sent = [at - it.begun for at, f in it.bus.sent if f.can_id == EMERGENCY + 1]
     (at,) = [at for at in sent if at > 4 * SECOND]
     assert at < 5600 * MS
@@ -276,10 +327,11 @@ def test_an_emergency_that_meets_a_full_bus_long_after_the_last_frame_waits_and_
 
 
 @pytest.mark.parametrize("answer", [Sent.DOWN, Sent.GONE])
-def test_an_interface_that_fails_is_noticed_with_the_next_frame(
-    answer: Sent, monkeypatch: pytest.MonkeyPatch
+def test_a_failed_interface_is_noticed_at_the_next_frame(
+    answer: Sent,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Neither is a full bus, for which turns in C would wait."""
+    """Neither error is a full bus, for which turns in C would wait."""
     it = InC(monkeypatch)
     it.feed(LiveData(consumed_charge=n) for n in range(300))
     it.run(1)
@@ -294,17 +346,17 @@ def test_an_interface_that_fails_is_noticed_with_the_next_frame(
     it.loop.close()
 
 
-def test_a_driver_that_is_busy_is_tried_again_every_two_milliseconds(
+def test_sending_to_a_busy_driver_is_retried_every_two_milliseconds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its socket stays writable: to wait until it is would use the whole processor."""
+    """Its socket stays writable, so waiting for that would use the whole processor."""
     it = InC(monkeypatch)
     it.feed(LiveData(consumed_charge=n) for n in range(300))
     it.run(1)
     it.bus.answer = Sent.BUSY
     it.run(1.2)
     assert 50 < len(it.bus.refused) <= 110
-    # the first attempt with a new frame, and those every 2 ms
+    # These are the first attempt with a new frame, and an attempt every 2 ms.
     assert it.loop.can.is_proven
     it.bus.answer = Sent.OK
     it.bus.sent.clear()
@@ -313,30 +365,30 @@ def test_a_driver_that_is_busy_is_tried_again_every_two_milliseconds(
     it.loop.close()
 
 
-def test_a_slow_bus_has_the_newest_of_each_page_of_a_multiplexed_message(
+def test_a_slow_bus_gets_the_newest_pages_of_a_multiplexed_message(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A page that waits is replaced by the same page only."""
+    """A waiting page is replaced only by a newer version of the same page."""
     signals = [Sig("Page", 0, 8, mux="M")]
-    signals += [
-        Sig(f"Speed{n}", 8, 32, unit="1/min", mux=f"m{n}", source="electrical_speed")
-        for n in range(8)
-    ]
-    layout = compiled(
-        dbc_text([Msg("Pages", 0x100, 8, signals)], EVENT),
-        bind={f"Pages.{signal.name}": signal.source for signal in signals[1:]},
-    )
+    source = "electrical_speed"
+    for page in range(8):
+        name = f"Speed{page}"
+        signals.append(Sig(name, 8, 32, unit="1/min", mux=f"m{page}", source=source))
+    text = dbc_text([Msg("Pages", 0x100, 8, signals)], EVENT)
+    bind: dict[str, str | float] = {f"Pages.{signal.name}": source for signal in signals[1:]}
+    layout = compiled(text, bind=bind)
     it = InC(monkeypatch, layout, (EscSettings("esc1", timeout_ns=SECOND),))
     it.bus.frame_ns = 15 * MS
     made: list[int] = []
     for at in range(it.begun, it.begun + 4 * SECOND, 10 * MS):
-        # each makes one page, faster than the bus takes them for a while; then the bus catches up
+        # Each frame causes one page, at first faster than the bus takes them. Then it catches up.
         if (at - it.begun) % SECOND < 400 * MS:
             made.append(at)
             wire = encode(LiveData(electrical_speed=len(made)), WireLayout.V4)
             it.world.wires[0].put(wire, [at] * len(wire))
     it.run(4)
-    status, transmitter = it.loop.gateway.status, it.loop.can.transmitter
+    status = it.loop.gateway.status
+    transmitter = it.loop.can.transmitter
     it.loop.close()
     pages: dict[int, list[int]] = {}
     after: Counter[int] = Counter()
@@ -354,12 +406,13 @@ def test_a_slow_bus_has_the_newest_of_each_page_of_a_multiplexed_message(
     for speeds in pages.values():
         assert speeds == sorted(set(speeds))
     assert status.replaced_frames > 15
-    assert (transmitter.is_stalled, status.dropped_frames) == (False, 0)
+    assert not transmitter.is_stalled
+    assert status.dropped_frames == 0
     assert it.loop._poller.count > 150, "most turns are in C"  # type: ignore[attr-defined]
 
 
 def test_each_change_of_the_ports_leaves_one_epoll_open(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or a port that comes and goes uses up the process's descriptors."""
+    """Otherwise a flapping port would use up the process's descriptors."""
     opened = c.c_int.in_dll(native_world.library(), "fake_epolls")
     before = opened.value
     it = InC(monkeypatch)
@@ -374,7 +427,7 @@ def test_each_change_of_the_ports_leaves_one_epoll_open(monkeypatch: pytest.Monk
 
 
 @pytest.mark.extended
-def test_turns_and_hold_ups_touch_nothing_outside_their_memory_and_nothing_is_undefined(
+def test_turns_and_hold_ups_have_no_memory_error_or_undefined_behaviour(
     tmp_path: Path,
 ) -> None:
     found = run_sanitized(tmp_path, "-c", _UNDER_SANITIZERS)
@@ -394,13 +447,13 @@ for seed, frame_ns, has_nodes in ((0, 0, True), (2, 20_000_000, False), (5, 0, T
         it = test_turns_in_c.Recorded(seed, each, has_nodes)
         it.bus.frame_ns = frame_ns
         print(len(it.sent()))
-hold_ups = test_hold_ups.test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true
+hold_ups = test_hold_ups.test_after_any_hold_up_values_end_in_time_and_ages_are_true
 for seed in range(3):
     hold_ups.hypothesis.inner_test(seed, 60, 10, 0.05, seed % 2, seed % 3)
 """
 
 
-def test_nothing_is_handed_to_the_kernel_in_bus_off_by_turns_in_c(
+def test_turns_in_c_send_no_frame_in_bus_off(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     turns = InC(monkeypatch)
@@ -413,4 +466,4 @@ def test_nothing_is_handed_to_the_kernel_in_bus_off_by_turns_in_c(
     turns.run(1.9)
     assert len(turns.bus.sent) == sent_before
     turns.run(2.5)
-    assert len(turns.bus.sent) > sent_before, "nobody confirmed the bus-off within a second"
+    assert len(turns.bus.sent) > sent_before, "the bus-off was not confirmed within a second"

@@ -1,4 +1,4 @@
-"""The core in C runs where it can; where it cannot, the one in Python does, and the gateway says why."""
+"""The C core runs if possible. Otherwise the Python core runs, and the gateway logs why."""
 
 import os
 import struct
@@ -35,6 +35,7 @@ CYCLE = (
     'BA_DEF_DEF_ "GenMsgCycleTime" 0;\nBA_ "GenMsgCycleTime" BO_ 256 {};\n'
 )
 VOLTAGE = 'BatteryVoltage : 0|{}@1+ ({},0) [0|0] "V"'
+LINK_STATE = 'LinkState : 0|32@1+ (0.00592884289493769,89.21540281025877) [0|0] ""'
 
 
 @pytest.fixture(autouse=True)
@@ -54,23 +55,42 @@ needs_c = pytest.mark.skipif(
 def layout_of(signal: str, more: str = "", length: int = 8) -> Layout:
     text = HEAD.format(signal).replace("M: 8", f"M: {length}") + more
     database = parse_database(text.encode(), "t.dbc")
-    return prepare(database, "t.dbc", (EscSettings(),), DbcConfig(), fd_allowed=True)
+    return prepare(
+        database,
+        "t.dbc",
+        (EscSettings(),),
+        DbcConfig(),
+        fd_allowed=True,
+    )
 
 
 def why(layout: Layout = EMPTY, **settings: object) -> str:
-    """Of a gateway with one ESC: why it has the core in Python."""
+    """Return why a gateway with one ESC has the Python core, or ""."""
     gateway = Gateway([replace(EscSettings(), **settings)], layout, 0)  # type: ignore[arg-type]
     assert gateway.core.language == ("Python" if gateway.why_python else "C")
     return gateway.why_python
 
 
 @needs_c
-@pytest.mark.parametrize(("pure", "said"), [("", ""), ("0", ""), ("1", "KONTRONIK_PURE is set")])
-def test_it_is_the_one_in_c_unless_the_other_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch, pure: str, said: str
+@pytest.mark.parametrize(
+    ("pure", "said"),
+    [
+        ("", ""),
+        ("0", ""),
+        ("1", "KONTRONIK_PURE is set"),
+    ],
+)
+def test_the_c_core_runs_unless_the_python_core_is_requested(
+    monkeypatch: pytest.MonkeyPatch,
+    pure: str,
+    said: str,
 ) -> None:
     monkeypatch.setenv(load.PURE, pure)
     assert why() == said
+
+
+DAMAGED = "core-other.so: cut off or damaged"
+OTHER_MACHINE = "core-other.so: built for another machine"
 
 
 @needs_c
@@ -79,21 +99,23 @@ def test_it_is_the_one_in_c_unless_the_other_is_asked_for(
     [
         (lambda _: None, "no core-other.so in this installation"),
         (lambda _: None, "there was no C compiler at the installation"),
-        (lambda whole: whole[:-1], "core-other.so: cut off or damaged"),
-        (lambda whole: whole[:4096] + bytes(4096) + whole[8192:], "core-other.so: cut off or damaged"),
-        (lambda whole: sealed(whole[:18] + b"\xfe\xca" + whole[20:-4]), "core-other.so: built for another machine"),
-        (lambda whole: sealed(whole[:4] + bytes((whole[4] ^ 3,)) + whole[5:-4]), "core-other.so: built for another machine"),
+        (lambda whole: whole[:-1], DAMAGED),
+        (lambda whole: whole[:4096] + bytes(4096) + whole[8192:], DAMAGED),
+        (lambda whole: sealed(whole[:18] + b"\xfe\xca" + whole[20:-4]), OTHER_MACHINE),
+        (lambda whole: sealed(whole[:4] + bytes((whole[4] ^ 3,)) + whole[5:-4]), OTHER_MACHINE),
         (lambda whole: sealed(whole[:64] + bytes(9)), "core-other.so: "),
     ],
-)  # fmt: skip
-def test_an_object_that_cannot_be_loaded_is_refused_in_one_line_and_the_one_in_python_runs(
+)
+def test_the_python_core_runs_if_the_c_core_cannot_be_loaded(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     made_of: Callable[[bytes], bytes | None],
     said: str,
 ) -> None:
-    path, not_built = tmp_path / "core-other.so", tmp_path / "not_built.txt"
-    if (content := made_of(objects.shared_object().read_bytes())) is not None:
+    path = tmp_path / "core-other.so"
+    not_built = tmp_path / "not_built.txt"
+    content = made_of(objects.shared_object().read_bytes())
+    if content is not None:
         path.write_bytes(content)
     monkeypatch.setattr(load, "shared_object", lambda: path)
     monkeypatch.setattr(objects, "NOT_BUILT", not_built)
@@ -101,18 +123,25 @@ def test_an_object_that_cannot_be_loaded_is_refused_in_one_line_and_the_one_in_p
         not_built.write_text(f"{said}\n")
     found = why()
     assert load.in_words("Python", found) == f"core: Python ({found})"
-    assert found.startswith(said) and "\n" not in found and len(found) < 200
+    assert found.startswith(said)
+    assert "\n" not in found
+    assert len(found) < 200
 
 
 @pytest.mark.parametrize(
     ("machine", "bits", "its"),
     [
-        *(("aarch64", 64, "aarch64"), ("aarch64", 32, "armv7l")),
-        *(("armv6l", 32, "armv6l"), ("x86_64", 32, "i686")),
+        ("aarch64", 64, "aarch64"),
+        ("aarch64", 32, "armv7l"),
+        ("armv6l", 32, "armv6l"),
+        ("x86_64", 32, "i686"),
     ],
 )
-def test_a_process_of_32_bits_has_an_object_of_its_own(
-    monkeypatch: pytest.MonkeyPatch, machine: str, bits: int, its: str
+def test_a_process_of_32_bits_loads_its_own_object(
+    monkeypatch: pytest.MonkeyPatch,
+    machine: str,
+    bits: int,
+    its: str,
 ) -> None:
     monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine=machine))
     monkeypatch.setattr(sys, "maxsize", (1 << bits - 1) - 1)
@@ -120,8 +149,8 @@ def test_a_process_of_32_bits_has_an_object_of_its_own(
 
 
 @needs_c
-def test_where_ctypes_may_not_load_the_one_in_python_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As under a unit that forbids memory to be executed, on some machines."""
+def test_the_python_core_runs_if_ctypes_may_not_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On some machines a systemd unit that forbids executable memory causes this."""
     monkeypatch.setitem(sys.modules, "kontronik_can_gw.native.binding", None)
     assert why().startswith("ctypes cannot be used here: ")
 
@@ -131,7 +160,7 @@ NOT_AVAILABLE = 0xFFFF_FFFF
 
 
 @needs_c
-def test_what_a_master_writes_beyond_its_limits_leaves_the_speeds_not_available() -> None:
+def test_settings_beyond_the_limits_make_speeds_not_available() -> None:
     gateway = Gateway([EscSettings(pole_pairs=7)], layout_of(SPEEDS), 0)
     assert gateway.core.language == "C"
     cases = (
@@ -153,12 +182,22 @@ def test_what_a_master_writes_beyond_its_limits_leaves_the_speeds_not_available(
 
 
 @needs_c
-def test_what_the_core_in_c_cannot_express_runs_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_that_the_c_core_cannot_express_run_in_python(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     other = replace(protocols.PROTOCOLS[0], name="other", wire=None)
     monkeypatch.setattr(protocols, "PROTOCOLS", (*protocols.PROTOCOLS, other))
     assert why(protocol="other") == "ESC protocol other"
     assert why(gear=Fraction(MAX_GEAR)) == ""
     assert f"parts above {MAX_GEAR}" in why(gear=Fraction(MAX_GEAR + 1))
+
+
+@needs_c
+def test_an_object_of_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number that an object carries covers the generated header, not only the C files."""
+    header = objects.wire_header()
+    monkeypatch.setattr(objects, "wire_header", lambda: header.replace("live, 4", "live, 5"))
+    assert why() == f"{objects.shared_object().name}: made of other sources than these"
 
 
 @needs_c
@@ -169,21 +208,24 @@ def test_what_the_core_in_c_cannot_express_runs_in_python(monkeypatch: pytest.Mo
         (VOLTAGE.format(16, "1e70"), "", "leaves 64 bits. Factor"),
         (VOLTAGE.format(16, "18446744073709551616"), "", "leaves 64 bits. Factor"),
         (VOLTAGE.format(16, "1e-70"), "", "M.BatteryVoltage: "),
-        ('LinkState : 0|32@1+ (0.00592884289493769,89.21540281025877) [0|0] ""', "", "leaves 64 bits. Factor"),
+        (LINK_STATE, "", "leaves 64 bits. Factor"),
         (VOLTAGE.format(16, "0.01"), CYCLE.format(10_000_000_000_000), "a cycle or distance"),
         (VOLTAGE.format(64, "0.01"), "", ""),
         (VOLTAGE.format(65, "0.01"), "", "M.BatteryVoltage: 65 bits"),
     ],
-)  # fmt: skip
+)
 def test_numbers_that_leave_64_bits_run_in_python(signal: str, more: str, said: str) -> None:
     found = why(layout_of(signal, more, 64))
-    assert said in found and bool(said) == bool(found)
+    assert said in found
+    assert bool(said) == bool(found)
 
 
-def test_a_compiler_that_fails_is_said_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_failing_compiler_is_reported_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    program, target = tmp_path / "cc", tmp_path / "core.so"
+    program = tmp_path / "cc"
+    target = tmp_path / "core.so"
     program.write_text("#!/bin/sh\nprintf 'In file:\\nfatal error: \\377' >&2\nexit 1\n")
     program.chmod(0o755)
     said = f"at the installation {program} failed: fatal error: \ufffd"

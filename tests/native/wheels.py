@@ -1,9 +1,9 @@
-"""One wheel with the core in C for every machine that there is a cross compiler for, and a look at it: make wheels.
+"""Builds one wheel with the C core for every machine with a cross compiler, and checks it.
 
     python tests/native/wheels.py [FOLDER]
 
-Each object must need no library and no version of one. Exits with 1 if one does. That they run on their machines is tried with the Debian
-packages, which have the same ones (tests/deb).
+No object may need a library or a version of one. If one does, the exit code is 1. tests/deb runs
+the same objects on their machines.
 """
 
 import os
@@ -22,7 +22,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 
 
 def build(folder: Path) -> Path:
-    """The wheel."""
+    """Build the wheel. Return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation"]
     environment = os.environ | {"KONTRONIK_WHEEL_FOR_ALL": "1"}
@@ -33,7 +33,7 @@ def build(folder: Path) -> Path:
 
 
 def mistakes(wheel: Path) -> Iterator[str]:
-    """What is wrong with a wheel and its objects: libraries that one needs, and what not every C library has."""
+    """Yield the problems of a wheel: needed libraries, and symbols that a C library may lack."""
     if not wheel.name.endswith("-py3-none-any.whl"):
         yield f"{wheel.name}: a wheel for one machine"
     with tempfile.TemporaryDirectory(prefix="kcg-wheel.") as made:
@@ -48,7 +48,8 @@ def mistakes(wheel: Path) -> Iterator[str]:
             if "(NEEDED)" in text:
                 yield f"{path.name}: needs a library"
             for name in set(re.findall(r" UND (\S+)", text)):
-                if "@" in name or (name.startswith("_") and name != "__errno_location"):
+                is_internal = name.startswith("_") and name != "__errno_location"
+                if "@" in name or is_internal:
                     yield f"{path.name}: needs {name}"
 
 

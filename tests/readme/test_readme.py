@@ -181,7 +181,7 @@ def given(block: Block) -> object:
 
 
 @pytest.mark.parametrize("block", [given(block) for block in blocks("")])
-def test_a_block_can_be_typed_as_it_stands(block: Block, files: Path, tmp_path: Path) -> None:
+def test_a_shell_block_can_be_typed_as_it_is(block: Block, files: Path, tmp_path: Path) -> None:
     for program, package in NEEDS.items():
         if f"{program} -" in block.text and shutil.which(program) is None:
             pytest.skip(f"no {program}: sudo apt-get install {package}")

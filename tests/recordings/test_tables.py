@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from recordings import (
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.esc_stream import EscStream
+from kontronik_can_gw.desk.recordings import tables
 from kontronik_can_gw.desk.recordings.convert import _table_writer
 from kontronik_can_gw.desk.recordings.fields import (
     Choice,
@@ -168,6 +170,32 @@ def test_any_values_read_back_equal(
         if has_utc:
             assert cells["Utc"] == utc_text(wall_ns)
         assert tuple(cells[field.name] for field in FIELDS) == values
+
+
+@pytest.mark.parametrize("kept", [2, 1024])
+@pytest.mark.parametrize("form", ["csv", "jsonl"])
+def test_a_row_has_the_same_text_alone_and_among_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str, kept: int
+) -> None:
+    """Texts are kept by value, and -0.0 is equal to 0.0."""
+    monkeypatch.setattr(tables, "_KEPT_TEXTS", kept)
+    floats = [0.0, -0.0, 0.0, 1.5, math.inf, -math.inf, None, 1e-7, 1e300, 1.5, -0.0, 2.0, 3.0]
+    wholes = [0, 1, None, 1 << 60, -5, 0, 2, 3, 4, 5, 6, 1, 0]
+    columns: list[list[Any]] = [wholes, wholes, floats]
+    columns.append([TEXTS[n % 4][1] if n % 3 else None for n in range(13)])
+    times = [1000 * n * n for n in range(13)]
+    whole = Block(times, columns, WALL_NS)
+    texts = []
+    for blocks in ([whole], [whole.part(n, n + 1) for n in range(13)]):
+        with (tmp_path / "table").open("wb") as file:
+            for block in blocks:
+                writer = _table_writer(file, form, Table(FIELDS, has_utc=True))
+                writer.write(block)
+        text = (tmp_path / "table").read_text(encoding="utf-8")
+        header = text.splitlines()[0] + "\n" if form == "csv" else ""
+        texts.append(text.replace(header, "") if header else text)
+    assert texts[0] == texts[1]
+    assert texts[0].count("-0.0") == 2
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -12,7 +12,7 @@ from simulated_bus import flight
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import Block
-from kontronik_can_gw.desk.recordings.samples import fields_of_log, samples_of_frames
+from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
@@ -26,8 +26,9 @@ def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()
     given = [*options, *[EscOptions()] * len(bus.escs)][: len(bus.escs)]
     reader = SignalReader(bus.layout)
     frames = (TimedFrame(5 * SECOND + now, frame) for now, frame in flight(bus, seconds, given))
-    for sample in samples_of_frames(frames, reader, range(len(reader.columns))):
-        yield sample.time_ns, list(sample.values)
+    rows = RowsOfFrames(reader, range(len(reader.columns)))
+    for times, columns in rows.blocks(frames, count=100):
+        yield from zip(times, map(list, zip(*columns, strict=True)), strict=True)
 
 
 def flight_of(bus: BusLayout, rows: Iterable[Row], points: int = 2000) -> Flight:

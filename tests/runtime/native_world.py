@@ -1,4 +1,7 @@
-"""The World for a loop that turns in C: what linux.c asks of the kernel is answered by it (tests/native/fake_kernel.c)."""
+"""The World for a loop that turns in C: it answers the system calls of linux.c.
+
+tests/native/fake_kernel.c passes the calls on to the World.
+"""
 
 import ctypes as c
 import errno
@@ -41,7 +44,7 @@ _REFUSALS = {
     Sent.DOWN: errno.ENETDOWN,
     Sent.GONE: errno.ENODEV,
 }
-"""The errno with which a socket gives each answer of a bus."""
+"""The errno of a socket for each answer of a bus."""
 
 
 class _Kernel(c.Structure):
@@ -58,7 +61,7 @@ class _Kernel(c.Structure):
 
 @cache
 def library(flags: tuple[str, ...] = ("-O1",)) -> Any:
-    """The core in C with this kernel."""
+    """Compile and load the C core with the fake kernel."""
     names = [f"-D{call}=fake_{call}" for call in (*_CALLS, "sendmmsg")]
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder, "core.so")
@@ -67,21 +70,35 @@ def library(flags: tuple[str, ...] = ("-O1",)) -> Any:
 
 
 class FakeNativePoller(NativePoller):
-    """Waits as the world says, in Python and in C."""
+    """A poller that waits by the time of the World, in Python and in C."""
 
     def __init__(self, world: "World", gateway: Gateway) -> None:
         super().__init__(gateway, world.clock)
         self._world = world
         self._data = (c.c_uint8 * (1 << 16)).in_dll(library(), "fake_data")
         kinds: list[Any] = [kind for _, kind in _Kernel._fields_]
-        of_world = (world.clock, world.pass_until, self._look, world.ready)
-        calls = (*of_world, self._read, self._send, self._settings)
-        self._kernel = _Kernel(*(kind(call) for kind, call in zip(kinds, calls, strict=True)))
+        calls: list[Any] = [
+            world.clock,
+            world.pass_until,
+            self._look,
+            world.ready,
+            self._read,
+            self._send,
+            self._settings,
+        ]
+        pairs = zip(kinds, calls, strict=True)
+        self._kernel = _Kernel(*(kind(call) for kind, call in pairs))
         library().fake_use(c.byref(self._kernel))
 
-    def register(self, fd: int, handler: Handler, events: int = 1, esc: int | None = None) -> None:
+    def register(
+        self,
+        fd: int,
+        handler: Handler,
+        events: int = 1,
+        esc: int | None = None,
+    ) -> None:
         self._world.register(fd, handler, events)
-        if fd >= 1000:  # the others are real ones
+        if fd >= 1000:  # smaller numbers are real descriptors
             self._watched[fd] = (handler, events, esc)
             self.changes += 1
 
@@ -91,13 +108,29 @@ class FakeNativePoller(NativePoller):
         self.changes += 1
 
     def turn(
-        self, can: CanLink, last: int, due: int, leave: int, period: int
+        self,
+        can: CanLink,
+        last: int,
+        due: int,
+        leave: int,
+        period: int,
     ) -> list[tuple[Handler, int]] | None:
-        return super().turn(can, last, min(due, self._world.until), leave, period)
+        return super().turn(
+            can,
+            last,
+            min(due, self._world.until),
+            leave,
+            period,
+        )
 
-    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+    def wait(
+        self,
+        last: int,
+        due: int,
+    ) -> list[tuple[Handler, int]]:
         ready = self._world.wait(last, due)
-        self.before, self.now = self._world.before, self._world.looked
+        self.before = self._world.before
+        self.now = self._world.looked
         self.late = self._world.late
         return ready
 

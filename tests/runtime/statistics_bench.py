@@ -1,4 +1,4 @@
-"""A gateway with simulated ESCs whose time is passed in, and documents of it."""
+"""A gateway with simulated ESCs, and its status documents. Time is passed in."""
 
 import json
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ PROGRAM = ProgramFacts(
 
 @dataclass
 class Bench:
-    """``escs`` simulated ESCs that are heard from START on."""
+    """A gateway that receives frames of ``escs`` simulated ESCs from the time START."""
 
     escs: int = 2
     settings: EscSettings = field(default_factory=lambda: EscSettings("esc", 7, Fraction(98, 10)))
@@ -48,7 +48,7 @@ class Bench:
         self.silent: set[int] = set()
 
     def run(self, seconds: float) -> None:
-        """Let time pass in steps of 10 ms; ``silent`` ESCs are not heard."""
+        """Let time pass in steps of 10 ms. Frames of ``silent`` ESCs do not arrive."""
         end = self.now + round(seconds * SECOND)
         while self.now < end:
             self.now += 10 * MS
@@ -59,33 +59,57 @@ class Bench:
                         self.sent[number].append(frame.data)
             self.gateway.advance(self.now)
 
-    def newest(self, esc: int, kind: type[LiveData] | type[InfoData]) -> Any:
+    def newest(
+        self,
+        esc: int,
+        kind: type[LiveData] | type[InfoData],
+    ) -> Any:
         return next(data for data in reversed(self.sent[esc]) if isinstance(data, kind))
 
-    def document(self, *, at: int | None = None, **facts: Any) -> dict[str, Any]:
-        """The document now, as a reader of the file gets it; ``facts``: those of a Moment that are others."""
-        moment = moment_of(self.gateway, self.now if at is None else at)._replace(**facts)
+    def document(
+        self,
+        *,
+        at: int | None = None,
+        **facts: Any,
+    ) -> dict[str, Any]:
+        """Return the document as a reader of the file gets it.
+
+        ``at`` is the time of the document, by default now. ``facts`` replace fields of the Moment.
+        """
+        if at is None:
+            at = self.now
+        moment = moment_of(self.gateway, at)._replace(**facts)
         read: dict[str, Any] = json.loads(snapshot(moment))
         return read
 
 
 def moment_of(gateway: Gateway, now: int) -> Moment:
-    """What the statistics are made of, of a gateway whose ports and bus are open."""
+    """Return the Moment of a gateway whose ports and bus are open."""
+    names = [esc.settings.name for esc in gateway.escs]
     return Moment(
         gateway_facts(gateway),
         now=now,
         wall=1_700_000_000.5,
         program=PROGRAM,
         process=ProcessFacts(20_000_000, 12, 3),
-        ports=[PortFacts(e.settings.name, f"/dev/{e.settings.name}", True) for e in gateway.escs],
+        ports=[PortFacts(name, f"/dev/{name}", True) for name in names],
         can=CanFacts("socketcan", "can0", 500_000, True),
     )
 
 
-def with_nodes(document: Mapping[str, Any], count: int = 2, sent: int = 0) -> dict[str, Any]:
-    """The document of a gateway with CANopen nodes."""
-    nodes = [
-        {"esc": f"esc{n + 1}", "node_id": n + 1, "state": "operational", "pdos_sent": sent + n}
-        for n in range(count)
-    ]
+def with_nodes(
+    document: Mapping[str, Any],
+    count: int = 2,
+    sent: int = 0,
+) -> dict[str, Any]:
+    """Return the document of a gateway with CANopen nodes."""
+    nodes = []
+    for number in range(count):
+        node = {
+            "esc": f"esc{number + 1}",
+            "node_id": number + 1,
+            "state": "operational",
+            "pdos_sent": sent + number,
+        }
+        nodes.append(node)
     return {**document, "nodes": nodes}

@@ -1,4 +1,7 @@
-"""The CAN interface in the loop: bus-off and its end, outages, a stalled bus. Time is passed in, port and kernel are scripted."""
+"""The CAN interface in the loop: bus-off and recovery, outages, a stalled bus.
+
+Time is passed in. The port and the kernel are scripted.
+"""
 
 import logging
 from collections.abc import Iterator
@@ -27,17 +30,29 @@ from kontronik_can_gw.times import MS, NEVER, SECOND
 
 @pytest.fixture(autouse=True)
 def locks_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or a test of this file that runs at the same time in another process is another gateway with the same node."""
+    """Give each test its own locks.
+
+    Otherwise a test of this file that runs in another process at the same time would be another
+    gateway with the same node.
+    """
     monkeypatch.setattr(folders, "RUN", tmp_path / "run")
 
 
-ACTIVE = LinkFacts(True, True, "can", CanState.ERROR_ACTIVE, 500_000, 100, (0, 0))
+ACTIVE = LinkFacts(
+    True,
+    True,
+    "can",
+    CanState.ERROR_ACTIVE,
+    500_000,
+    100,
+    (0, 0),
+)
 OFF = ACTIVE._replace(state=CanState.BUS_OFF)
 BOOT_UP = (0x701, b"\0")
 
 
 class Port(Bus):
-    """A SocketCAN port; ``there`` False: it cannot be opened."""
+    """A SocketCAN port. It cannot be opened while ``there`` is False."""
 
     there = True
 
@@ -49,7 +64,7 @@ class Port(Bus):
 
 
 class Kernel:
-    """What rtnetlink tells: ``facts`` on being asked, and ``news`` by itself."""
+    """The messages of rtnetlink: ``facts`` answers a request, ``news`` arrives unasked."""
 
     def __init__(self) -> None:
         self.facts: LinkFacts | None = None
@@ -66,19 +81,28 @@ class Kernel:
             self._waiting.append(self.facts)
 
     def take(self) -> list[LinkFacts]:
-        told, self._waiting, self.news = [*self.news, *self._waiting], [], []
-        return told
+        reports = [*self.news, *self._waiting]
+        self._waiting = []
+        self.news = []
+        return reports
 
     def close(self) -> None:
         pass
 
 
 class Bench:
-    def __init__(self, kernel: Kernel, self_start: bool = True, has_node: bool = True) -> None:
+    def __init__(
+        self,
+        kernel: Kernel,
+        self_start: bool = True,
+        has_node: bool = True,
+    ) -> None:
         canopen = {"enabled": has_node, "self_start": self_start, "store": "/nowhere"}
         loaded = assemble(parse({"canopen": canopen, "esc": [{"port": "p"}]}, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
-        self.kernel, self.now, self.clock = kernel, 0, 0
+        self.kernel = kernel
+        self.now = 0
+        self.clock = 0
         self.world = World()
         self.can = CanLink(
             loaded.config.can,
@@ -99,14 +123,17 @@ class Bench:
         self.can.transmit(self.now)
 
     def begin(self) -> None:
-        """The interface is open, and what was sent first is taken."""
+        """Open the interface, and discard the first frames."""
         self.kernel.facts = ACTIVE
         self.start()
         self.turn(300)
         self.take()
 
     def turn(self, ms: int = 1) -> None:
-        """As the loop does, a millisecond at a time; a deadline that stays in the past would make the loop spin."""
+        """Do the work of the loop in steps of a millisecond.
+
+        A deadline that stays in the past would make the loop spin.
+        """
         for _ in range(ms):
             self.now += MS
             self.clock = self.now
@@ -124,13 +151,15 @@ class Bench:
         self.can._follow_reception(self.now)
 
     def goes_off(self) -> None:
-        """The controller: the error frame, and what rtnetlink says from then on."""
+        """Put the controller in bus-off: it sends the error frame, and rtnetlink reports it."""
         self.kernel.facts = OFF._replace(running=False)
         self.error_frame(CanState.BUS_OFF)
 
     def changes(self, facts: LinkFacts, there: bool = True) -> None:
-        """The interface, which rtnetlink tells."""
-        self.kernel.facts, self.kernel.news, Port.there = facts, [facts], there
+        """Change the interface. rtnetlink reports it."""
+        self.kernel.facts = facts
+        self.kernel.news = [facts]
+        Port.there = there
 
     def take(self) -> list[tuple[int, bytes]]:
         return self.port.take()
@@ -152,20 +181,28 @@ def bench(kernel: Kernel) -> Iterator["Bench"]:
     made.can.close()
 
 
-def told(frames: list[tuple[int, bytes]]) -> list[str]:
-    """Boot-ups and emergencies, in words."""
-    words = {BOOT_UP: "boot-up"}
-    named = [
-        words.get(frame) or (frame[1][1::-1].hex() if frame[0] == 0x081 else "") for frame in frames
-    ]
-    return [name for name in named if name]
+def boot_ups_and_emergencies(frames: list[tuple[int, bytes]]) -> list[str]:
+    """Return the boot-ups as "boot-up" and the emergencies as their code in hex."""
+    names = []
+    for frame in frames:
+        can_id, data = frame
+        if frame == BOOT_UP:
+            names.append("boot-up")
+        elif can_id == 0x081:
+            names.append(data[1::-1].hex())
+    return names
 
 
 @pytest.mark.parametrize("late_ms", [0, 1, 40, 300])
-def test_behind_a_restart_the_node_boots_and_says_8140h_as_soon_as_the_queue_runs(
-    bench: Bench, kernel: Kernel, late_ms: int
+def test_a_node_boots_and_sends_8140h_when_the_queue_runs_after_a_restart(
+    bench: Bench,
+    kernel: Kernel,
+    late_ms: int,
 ) -> None:
-    """The kernel's order: error frame "restarted", then the queue is started, which rtnetlink tells; before that frames vanish."""
+    """The kernel first sends the error frame "restarted", then starts the queue.
+
+    rtnetlink reports the start of the queue. Frames that are sent before it are lost.
+    """
     bench.begin()
     bench.goes_off()
     bench.turn(200)
@@ -178,13 +215,13 @@ def test_behind_a_restart_the_node_boots_and_says_8140h_as_soon_as_the_queue_run
         assert bench.take() == []
     bench.changes(ACTIVE)
     bench.turn(2)
-    assert told(bench.take()) == ["boot-up", "8140", "0000"]
+    assert boot_ups_and_emergencies(bench.take()) == ["boot-up", "8140", "0000"]
     bench.turn(3000)
-    assert told(bench.take()) == []
+    assert boot_ups_and_emergencies(bench.take()) == []
     assert bench.gateway.status.bus_off_count == 1
 
 
-def test_a_driver_that_reports_bus_off_late_makes_one_boot_up(
+def test_a_driver_that_reports_bus_off_late_causes_one_boot_up(
     bench: Bench,
     kernel: Kernel,
 ) -> None:
@@ -192,15 +229,17 @@ def test_a_driver_that_reports_bus_off_late_makes_one_boot_up(
     bench.goes_off()
     bench.turn(50)
     bench.error_frame(CanState.ERROR_ACTIVE)
-    kernel.facts = OFF  # it runs, and its driver has not noticed
+    kernel.facts = OFF  # the controller runs, but its driver has not noticed
     bench.turn(300)
     kernel.facts = ACTIVE
     bench.turn(2000)
-    assert told(bench.take()) == ["boot-up", "8140", "0000"]
+    assert boot_ups_and_emergencies(bench.take()) == ["boot-up", "8140", "0000"]
 
 
-def test_a_controller_that_nobody_restarts_costs_nothing_and_is_said_with_the_remedy(
-    bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture
+def test_a_controller_without_restart_is_reported_once_with_the_remedy(
+    bench: Bench,
+    kernel: Kernel,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     kernel.facts = ACTIVE._replace(restart_ms=0)
     bench.start()
@@ -213,7 +252,7 @@ def test_a_controller_that_nobody_restarts_costs_nothing_and_is_said_with_the_re
     assert sum("restart-ms is 0" in line for line in caplog.messages) == 1
 
 
-def test_old_news_of_a_link_does_not_close_what_was_opened(bench: Bench, kernel: Kernel) -> None:
+def test_an_old_report_of_a_link_does_not_close_a_new_port(bench: Bench, kernel: Kernel) -> None:
     bench.begin()
     bench.changes(LinkFacts(exists=False), there=False)
     bench.turn(100)
@@ -221,14 +260,14 @@ def test_old_news_of_a_link_does_not_close_what_was_opened(bench: Bench, kernel:
     bench.changes(ACTIVE)
     bench.now += SECOND
     kernel.news = [LinkFacts(exists=False)]
-    bench.can.reopen(bench.now)  # after its own pause, before it has read what the kernel reported
+    bench.can.reopen(bench.now)  # after its own pause, before it has read the kernel's report
     port = bench.can.port
     assert port is not None
     bench.turn(100)
     assert bench.can.port is port
 
 
-def test_what_we_sent_before_an_outage_is_no_conflict_when_it_comes_back(bench: Bench) -> None:
+def test_own_frames_returned_after_an_outage_are_no_conflict(bench: Bench) -> None:
     bench.kernel.facts = ACTIVE
     bench.start()
     bench.gateway.receive_frame(CanFrame(0x701, b"\5"), bench.now, bench.now)
@@ -238,8 +277,11 @@ def test_what_we_sent_before_an_outage_is_no_conflict_when_it_comes_back(bench: 
     assert bench.gateway.status.id_conflicts == 1
 
 
-def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
-    bench: Bench, kernel: Kernel, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+def test_an_outage_is_logged_with_the_remedy_and_when_it_ends(
+    bench: Bench,
+    kernel: Kernel,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     bench.begin()
@@ -252,7 +294,8 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
     with monkeypatch.context() as patch:
         patch.setattr(can_opener, "open_can", is_down)
         bench.turn(5000)
-    assert (bench.can.is_open, bench.gateway.status.can_state) == (False, CanState.DOWN)
+    assert not bench.can.is_open
+    assert bench.gateway.status.can_state == CanState.DOWN
     bench.changes(ACTIVE)
     bench.turn(100)
     down, back = caplog.messages
@@ -260,14 +303,18 @@ def test_an_outage_is_one_line_with_the_remedy_and_one_when_it_is_over(
     assert back.startswith("CAN can0: frames are sent again, after 5.0 s")
 
 
-def test_a_bus_that_stood_still_gets_no_backlog(
-    bench: Bench, caplog: pytest.LogCaptureFixture
+def test_a_bus_that_was_stalled_gets_no_backlog(
+    bench: Bench,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     bench.kernel.facts = ACTIVE
     bench.start()
     bench.gateway.receive_bytes(
-        0, encode(LiveData(battery_voltage=2400), Layout.V4), bench.now, bench.now
+        0,
+        encode(LiveData(battery_voltage=2400), Layout.V4),
+        bench.now,
+        bench.now,
     )
     bench.turn(100)
     bench.take()
@@ -279,7 +326,7 @@ def test_a_bus_that_stood_still_gets_no_backlog(
     bench.turn(50)
     sent = bench.take()
     assert [data for can_id, data in sent if can_id == 0x701] in ([], [b"\5"])
-    assert told(sent) == ["7510"], "telemetry was lost: told while nothing went, and told again"
+    assert boot_ups_and_emergencies(sent) == ["7510"], "the loss of telemetry is reported again"
     said = [message for message in caplog.messages if "no frame can be sent" in message]
     assert said == [
         "CAN can0: no frame can be sent: nobody acknowledges, or the bus is full. Trying again."
@@ -287,15 +334,20 @@ def test_a_bus_that_stood_still_gets_no_backlog(
     assert "CAN can0: frames are sent again, after 4.0 s" in caplog.messages
 
 
-def test_a_saturated_bus_is_no_dead_adapter(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of an adapter that does not tell the one from the other: it goes on taking a frame now and then."""
+def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(
+    bench: Bench,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The adapter does not report which of the two it is, but still takes a frame now and then."""
     monkeypatch.setattr(Port, "is_socket", False)
     bench.start()
-    port, before = bench.port, bench.can.port
+    port = bench.port
+    before = bench.can.port
     for n in range(3000):
         port.answer = Sent.OK if n % 3 else Sent.BUSY
+        data = bytes((n & 255,))
         for can_id in range(10):
-            bench.can.transmitter.queue.put_all([CanFrame(0x100 + can_id, bytes((n & 255,)))])
+            bench.can.transmitter.queue.put_all([CanFrame(0x100 + can_id, data)])
         bench.turn()
     assert bench.can.port is before
     port.answer = Sent.BUSY
@@ -306,31 +358,33 @@ def test_a_saturated_bus_is_no_dead_adapter(bench: Bench, monkeypatch: pytest.Mo
 
 def test_bus_off_and_lost_frames_are_counted_once(bench: Bench) -> None:
     bench.begin()
-    bench.port.bus_off_count, bench.port.overruns = 2, 1
+    bench.port.bus_off_count = 2
+    bench.port.overruns = 1
     for _ in range(2):
         bench.can.serve(bench.now)
     bench.turn(200)
     assert bench.gateway.status.bus_off_count == 2
-    assert told(bench.take()) == ["8110", "0000"]
-    bench.turn(1000)  # it is reported once a second at most
+    assert boot_ups_and_emergencies(bench.take()) == ["8110", "0000"]
+    bench.turn(1000)  # an overrun is reported at most once a second
     bench.port.overruns = 1
     for _ in range(3000):  # frames are received all the time
         bench.can.serve(bench.now)
         bench.turn()
-    assert told(bench.take()) == ["8110", "0000"]
+    assert boot_ups_and_emergencies(bench.take()) == ["8110", "0000"]
 
 
-def test_the_port_is_given_the_ids_that_change_while_it_is_open(bench: Bench) -> None:
+def test_changed_receive_ids_are_set_on_the_open_port(bench: Bench) -> None:
     bench.start()
     bench.turn(10)
-    assert 0x601 in bench.port._ids and 0x705 not in bench.port._ids
+    assert 0x601 in bench.port._ids
+    assert 0x705 not in bench.port._ids
     watch_node_5 = bytes.fromhex("23 16 10 01 2c 01 05 00")
     bench.gateway.receive_frame(CanFrame(0x601, watch_node_5), bench.now, bench.now)
     bench.turn(1)
     assert {0x601, 0x705} <= bench.port._ids
 
 
-def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> None:
+def test_an_adapter_that_fails_while_it_is_read_is_opened_again(bench: Bench) -> None:
     bench.start()
     bench.turn(100)
     before = bench.port
@@ -338,20 +392,27 @@ def test_an_adapter_that_fails_while_it_is_read_is_opened_anew(bench: Bench) -> 
     bench.can.serve(bench.now)
     assert not bench.can.is_open
     bench.turn(600)
-    assert bench.port is not before and bench.port._ids == before._ids
-    assert told(bench.take()) == ["boot-up"]
+    assert bench.port is not before
+    assert bench.port._ids == before._ids
+    assert boot_ups_and_emergencies(bench.take()) == ["boot-up"]
 
 
 def drone(kernel: Kernel, node_id: int = 42) -> Bench:
-    """A bench whose only output is DroneCAN."""
+    """Return a bench whose only output is DroneCAN."""
     made = Bench.__new__(Bench)
     table = {"enabled": True, "node_id": node_id}
     tables = {"dbc": {"enabled": False}, "dronecan": table, "esc": [{"port": "p"}]}
     loaded = assemble(parse(tables, "test"))
     made.gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
-    made.kernel, made.now, made.clock = kernel, 0, 0
+    made.kernel = kernel
+    made.now = 0
+    made.clock = 0
     made.can = CanLink(
-        *(loaded.config.can, made.gateway, World().poller, FaultLog()), clock=lambda: made.clock
+        loaded.config.can,
+        made.gateway,
+        World().poller,
+        FaultLog(),
+        clock=lambda: made.clock,
     )
     return made
 
@@ -365,11 +426,19 @@ def drone(kernel: Kernel, node_id: int = 42) -> Bench:
         pytest.param(None, id="no rtnetlink"),
     ],
 )
-def test_nothing_is_handed_to_the_kernel_in_bus_off(
-    kernel: Kernel, facts: LinkFacts | None, is_drone: bool
+def test_no_frame_is_sent_in_bus_off(
+    kernel: Kernel,
+    facts: LinkFacts | None,
+    is_drone: bool,
 ) -> None:
     made = drone(kernel) if is_drone else Bench(kernel)
-    kernel.facts = None if facts is None else facts._replace(state=facts.state and ACTIVE.state)
+    before = None
+    after = None
+    if facts is not None:
+        state = facts.state and ACTIVE.state
+        before = facts._replace(state=state)
+        after = ACTIVE._replace(state=state)
+    kernel.facts = before
     made.start()
     made.turn(1500)
     assert made.take() != []
@@ -379,7 +448,7 @@ def test_nothing_is_handed_to_the_kernel_in_bus_off(
     made.gateway.receive_bytes(0, encode(LiveData(1, 2442), Layout.V4), made.now, made.now)
     made.turn(10)
     assert made.take() == []
-    kernel.facts = None if facts is None else ACTIVE._replace(state=facts.state and ACTIVE.state)
+    kernel.facts = after
     made.error_frame(CanState.ERROR_ACTIVE)
     made.turn(1500)
     assert made.take() != []
@@ -387,10 +456,12 @@ def test_nothing_is_handed_to_the_kernel_in_bus_off(
 
 
 @pytest.mark.parametrize("told_by", ["state of no controller", "nothing", "no rtnetlink"])
-def test_a_bus_off_that_somebody_sent_on_a_virtual_bus_ends_after_a_second(
-    kernel: Kernel, monkeypatch: pytest.MonkeyPatch, told_by: str
+def test_a_forged_bus_off_on_a_virtual_bus_ends_after_a_second(
+    kernel: Kernel,
+    monkeypatch: pytest.MonkeyPatch,
+    told_by: str,
 ) -> None:
-    if told_by == "no rtnetlink":  # as for the buses of python-can
+    if told_by == "no rtnetlink":  # as with the buses of python-can
         monkeypatch.setattr(can_controller, "link_monitor", lambda _name: None)
     made = Bench(kernel)
     kernel.facts = ACTIVE._replace(state=None) if told_by == "state of no controller" else None
@@ -401,15 +472,15 @@ def test_a_bus_off_that_somebody_sent_on_a_virtual_bus_ends_after_a_second(
     made.turn(950)
     assert made.take() == []
     made.turn(300)
-    assert told(made.take())[0] == "boot-up"
+    assert boot_ups_and_emergencies(made.take())[0] == "boot-up"
     assert made.gateway.status.can_state is CanState.ERROR_ACTIVE
     made.turn(3000)
-    assert (made.can.controller.due == NEVER) == (told_by == "no rtnetlink"), "nobody to ask"
+    assert (made.can.controller.due == NEVER) == (told_by == "no rtnetlink"), "nothing to ask"
     made.can.close()
 
 
 def test_a_gateway_without_nodes_receives_the_same_ids_after_an_outage(kernel: Kernel) -> None:
-    """Others that send its messages are noticed then, too."""
+    """After the outage, other devices that send its messages are still noticed."""
     bench = Bench(kernel, has_node=False)
     bench.begin()
     before = bench.port
@@ -426,9 +497,11 @@ def test_a_gateway_without_nodes_receives_the_same_ids_after_an_outage(kernel: K
 
 @pytest.mark.parametrize("wait", [False, True])
 def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
-    bench: Bench, wait: bool, monkeypatch: pytest.MonkeyPatch
+    bench: Bench,
+    wait: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Not at the start, and not later when an adapter has come back under another name."""
+    """It is opened neither at the start nor later, when an adapter is back under another name."""
     opened: list[object] = []
     monkeypatch.setattr(can_opener, "open_can", opened.append)
     bench.can._opener._esc_at = lambda path: "left" if path == bench.can.config.channel else None
@@ -442,10 +515,10 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
     assert opened == []
 
 
-def test_an_adapter_that_was_pulled_out_in_bus_off_boots_its_node_when_it_is_back(
+def test_a_node_boots_when_an_adapter_unplugged_in_bus_off_is_back(
     bench: Bench,
 ) -> None:
-    """What is sent then is not lost in a bus-off that has ended with the old adapter."""
+    """The bus-off ended with the old adapter, so it does not suppress the boot-up."""
     bench.begin()
     bench.goes_off()
     bench.turn(100)
@@ -459,10 +532,11 @@ def test_an_adapter_that_was_pulled_out_in_bus_off_boots_its_node_when_it_is_bac
     assert BOOT_UP in bench.take()
 
 
-def test_frames_that_are_thrown_away_in_an_outage_are_told_to_who_records(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+def test_frames_discarded_in_an_outage_are_reported_to_the_recorder(
+    bench: Bench,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A replay would show them otherwise."""
+    """Otherwise a replay would contain them."""
     bench.begin()
     told_at: list[int] = []
     monkeypatch.setattr(bench.gateway, "not_sent", told_at.append)
@@ -478,10 +552,10 @@ def test_frames_that_are_thrown_away_in_an_outage_are_told_to_who_records(
     assert told_at == []
 
 
-def test_an_adapter_that_fails_now_and_then_is_opened_after_the_shortest_pause(
+def test_an_adapter_with_rare_failures_is_opened_after_the_shortest_pause(
     bench: Bench,
 ) -> None:
-    """Nothing reports that it is there again: pauses grow only while no frame can be sent."""
+    """The adapter's return is not reported. Pauses grow only while no frame can be sent."""
     bench.start()
     for _ in range(5):
         bench.turn(500)
@@ -494,7 +568,7 @@ def test_an_adapter_that_fails_now_and_then_is_opened_after_the_shortest_pause(
         assert bench.port is not failed
 
 
-def test_frames_that_are_received_are_counted(bench: Bench) -> None:
+def test_received_frames_are_counted(bench: Bench) -> None:
     bench.start()
     bench.turn(10)
     before = bench.gateway.status.received_frames

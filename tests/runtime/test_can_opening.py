@@ -1,4 +1,7 @@
-"""An interface whose driver takes long to open or close delays neither ports nor loop: real ports, a played driver, slcan on a pty."""
+"""An interface whose driver takes long to open or close delays neither ports nor loop.
+
+The ports are real, the driver is simulated, and slcan runs on a pseudo terminal.
+"""
 
 import os
 import pty
@@ -30,7 +33,7 @@ from kontronik_can_gw.times import SECOND
 
 ESCS = (EscSettings("esc1", timeout_ns=60_000_000_000),)
 LIMIT_S = 60
-"""Only a hang takes that long."""
+"""Time limit in s. Only a hang takes that long."""
 
 
 class Driver:
@@ -38,7 +41,8 @@ class Driver:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.begun = threading.Event()
-        self.may_open, self.may_close = threading.Event(), threading.Event()
+        self.may_open = threading.Event()
+        self.may_close = threading.Event()
         self.opened = 0
         self.closed_by: list[str] = []
         """Names of the threads that closed it."""
@@ -82,7 +86,7 @@ class Status(Notifier):
 
 @pytest.fixture
 def uart() -> Iterator[tuple[int, str]]:
-    """A serial port: the ESC's side, and the path of the gateway's side."""
+    """Yield a serial port: the descriptor of the ESC's side, the path of the gateway's side."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     yield master, os.ttyname(slave)
@@ -91,15 +95,28 @@ def uart() -> Iterator[tuple[int, str]]:
 
 
 class Running:
-    """A loop at work on one port, turned by the test."""
+    """A loop with one port. The test runs each turn."""
 
-    def __init__(self, uart: tuple[int, str], interface: str, channel: str, wait: bool) -> None:
+    def __init__(
+        self,
+        uart: tuple[int, str],
+        interface: str,
+        channel: str,
+        wait: bool,
+    ) -> None:
         self.esc, path = uart
         self.status = Status()
         gateway = Gateway(ESCS, layout_of(ESCS), 0)
         config = CanConfig(interface=interface, channel=channel)
         poller = poller_for(gateway)
-        self.loop = Loop(gateway, [path], config, wait, poller=poller, notifier=self.status)
+        self.loop = Loop(
+            gateway,
+            [path],
+            config,
+            wait,
+            poller=poller,
+            notifier=self.status,
+        )
         self.loop.open()
         self.loop.begin()
         self.sent = 0
@@ -129,15 +146,17 @@ class Running:
 
 
 def wait_for_opener() -> None:
-    """Until its thread has ended: the loop does not wait for it."""
+    """Wait until the opener's thread has ended. The loop does not wait for it."""
     for thread in threading.enumerate():
         if thread.name == "can-opener":
             thread.join(LIMIT_S)
 
 
 @pytest.mark.parametrize("wait", [True, False])
-def test_ports_are_served_while_a_driver_opens_and_frames_are_sent_then(
-    wait: bool, uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+def test_ports_are_served_while_a_driver_opens_and_frames_follow(
+    wait: bool,
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = Driver(monkeypatch)
     driver.may_close.set()
@@ -152,13 +171,15 @@ def test_ports_are_served_while_a_driver_opens_and_frames_are_sent_then(
     assert it.status.is_ready
     it.loop.end()
     wait_for_opener()
-    assert (driver.opened, driver.closed_by) == (1, ["can-opener"])
+    assert driver.opened == 1
+    assert driver.closed_by == ["can-opener"]
 
 
 def test_a_driver_that_takes_long_to_close_does_not_hold_up_the_end(
-    uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The thread is left alone. It ends with the process, or when the driver has returned."""
+    """The thread is not joined. It ends with the process, or when the driver has returned."""
     driver = Driver(monkeypatch)
     driver.may_open.set()
     it = Running(uart, "slcan", "/dev/none", wait=True)
@@ -170,8 +191,9 @@ def test_a_driver_that_takes_long_to_close_does_not_hold_up_the_end(
     assert driver.closed_by == ["can-opener"]
 
 
-def test_a_driver_that_fails_at_start_ends_the_loop_unless_it_may_wait(
-    uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+def test_a_driver_that_fails_at_start_ends_a_loop_that_may_not_wait(
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = Driver(monkeypatch)
     driver.error = RunError("CAN slcan /dev/none: cannot be opened: there is none.")
@@ -190,8 +212,9 @@ def test_a_driver_that_fails_at_start_ends_the_loop_unless_it_may_wait(
     it.loop.end()
 
 
-def test_a_driver_that_is_lost_is_closed_beside_the_loop_and_opened_after_that(
-    uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+def test_a_lost_driver_is_closed_beside_the_loop_and_opened_again(
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = Driver(monkeypatch)
     driver.may_open.set()
@@ -206,12 +229,14 @@ def test_a_driver_that_is_lost_is_closed_beside_the_loop_and_opened_after_that(
     count = len(driver.bus.sent)
     driver.may_close.set()
     it.turn_until(lambda: len(driver.bus.sent) > count)
-    assert (driver.opened, driver.closed_by) == (2, ["can-opener"])
+    assert driver.opened == 2
+    assert driver.closed_by == ["can-opener"]
     it.loop.end()
 
 
 def test_a_port_that_opens_after_the_end_is_closed(
-    uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     driver = Driver(monkeypatch)
     driver.may_close.set()
@@ -220,12 +245,15 @@ def test_a_port_that_opens_after_the_end_is_closed(
     it.loop.end()
     driver.may_open.set()
     wait_for_opener()
-    assert (driver.opened, driver.closed_by) == (1, ["can-opener"])
+    assert driver.opened == 1
+    assert driver.closed_by == ["can-opener"]
 
 
 @pytest.mark.parametrize("error", [None, RunError("CAN slcan /dev/none: there is none.")])
-def test_a_driver_that_does_not_return_from_opening_is_logged_until_it_does(
-    error: RunError | None, uart: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+def test_a_driver_that_does_not_return_from_opening_is_logged(
+    error: RunError | None,
+    uart: tuple[int, str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(can_link, "SLOW_OPENING_NS", 1000 * SECOND)  # no test takes that long
     driver = Driver(monkeypatch)
@@ -252,7 +280,10 @@ def test_a_driver_that_does_not_return_from_opening_is_logged_until_it_does(
 
 
 class Slcan(threading.Thread):
-    """An slcan adapter on a pseudo terminal: acknowledges commands and frames. ``frames``: those that it was given."""
+    """An slcan adapter on a pseudo terminal that acknowledges commands and frames.
+
+    ``frames`` has the frames that it received.
+    """
 
     def __init__(self, link: Path) -> None:
         super().__init__(daemon=True)
@@ -277,7 +308,7 @@ class Slcan(threading.Thread):
 
 
 class Clock:
-    """Stands in for the module `time` in python-can's slcan driver. The test ends its sleep."""
+    """Replacement for the module `time` in python-can's slcan driver. The test ends its sleep."""
 
     time = staticmethod(time.time)
 
@@ -290,9 +321,11 @@ class Clock:
 
 
 def test_slcan_sleeps_while_it_opens_and_no_byte_is_lost(
-    uart: tuple[int, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    uart: tuple[int, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """python-can's driver sleeps after it has opened the port: here until the test wakes it."""
+    """python-can's driver sleeps after it has opened the port, here until the test wakes it."""
     may_wake = threading.Event()
     monkeypatch.setattr(slcan, "time", Clock(may_wake))
     adapter = Slcan(tmp_path / "slcan")

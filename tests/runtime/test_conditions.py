@@ -1,4 +1,4 @@
-"""FaultLog: a line at the beginning, a line at the end, and no flood in between. Time is passed in."""
+"""FaultLog writes a line when a condition begins and one when it ends. Time is passed in."""
 
 import logging
 
@@ -18,7 +18,7 @@ def told(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
     return caplog
 
 
-def test_a_condition_is_one_line_at_each_end(
+def test_a_condition_is_logged_when_it_begins_and_when_it_ends(
     told: pytest.LogCaptureFixture,
 ) -> None:
     conditions = FaultLog()
@@ -34,9 +34,12 @@ def test_a_condition_is_one_line_at_each_end(
     assert conditions.reason("port") == ""
 
 
-def test_what_comes_and_goes_is_said_again_when_it_does_not(told: pytest.LogCaptureFixture) -> None:
-    conditions, now = FaultLog(), 0
-    for _ in range(300):  # ten minutes, each second lost and found
+def test_a_flapping_condition_is_logged_again_when_it_is_stable(
+    told: pytest.LogCaptureFixture,
+) -> None:
+    conditions = FaultLog()
+    now = 0
+    for _ in range(300):  # ten minutes: lost for a second, then back for a second
         conditions.begin(NAME, "lost", now)
         conditions.end(NAME, "ok", now + SECOND)
         now += 2 * SECOND
@@ -50,8 +53,12 @@ def test_what_comes_and_goes_is_said_again_when_it_does_not(told: pytest.LogCapt
 
 
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(1, 20)), max_size=400))
-def test_however_it_flaps_the_lines_are_few(happenings: list[tuple[str, bool, int]]) -> None:
-    conditions, now, lines = FaultLog(), 0, 0
+def test_a_flapping_condition_logs_a_bounded_number_of_lines(
+    happenings: list[tuple[str, bool, int]],
+) -> None:
+    conditions = FaultLog()
+    now = 0
+    lines = 0
     conditions.hold()
     for name, begins, seconds in happenings:
         now += seconds * SECOND

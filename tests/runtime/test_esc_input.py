@@ -1,4 +1,7 @@
-"""One ESC's port in the loop: which adapter is opened, what is counted, what is said. Time is passed in, ports are scripted."""
+"""One ESC's port in the loop: adapters, counters and log lines.
+
+Time is passed in, and the ports are scripted.
+"""
 
 import errno
 import logging
@@ -29,12 +32,13 @@ from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS, SECOND
 
-LEFT, RIGHT = Identity(0x403, 0x6001, "A1", "1.0"), Identity(0x403, 0x6001, "B2", "1.0")
+LEFT = Identity(0x403, 0x6001, "A1", "1.0")
+RIGHT = Identity(0x403, 0x6001, "B2", "1.0")
 LIVE = codec.encode(LiveData(battery_voltage=2442), codec.Layout.V4)
 
 
 class Port(Wire):
-    """A serial port that is told what to read. ``there``: path to adapter."""
+    """A serial port with scripted reads. ``there`` maps each path to its adapter."""
 
     there: dict[str, Identity | None]
 
@@ -60,7 +64,7 @@ class Port(Wire):
 
 
 class Bench:
-    """ESCs left and right at these paths, their ports open."""
+    """The ESCs "left" and "right" at these paths, with open ports."""
 
     def __init__(self, *paths: str) -> None:
         escs = [EscSettings(name) for name in ("left", "right")[: len(paths)]]
@@ -86,7 +90,8 @@ class Bench:
 
     def reopen(self, now: int) -> None:
         for esc in self.escs:
-            esc.reopen(now, tuple(other.identity for other in self.escs if other is not esc))
+            others = tuple(other.identity for other in self.escs if other is not esc)
+            esc.reopen(now, others)
 
 
 @pytest.fixture
@@ -94,36 +99,40 @@ def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, Identity | None]:
     ports: dict[str, Identity | None] = {}
     Port.there = ports
     monkeypatch.setattr(esc_input, "SerialPort", Port)
-    monkeypatch.setattr(
-        usb_adapters, "adapters", lambda: [(p, i) for p, i in ports.items() if i is not None]
-    )
+
+    def usb_ports() -> list[tuple[str, Identity]]:
+        return [(path, identity) for path, identity in ports.items() if identity is not None]
+
+    monkeypatch.setattr(usb_adapters, "adapters", usb_ports)
     return ports
 
 
 @pytest.fixture
 def bench(there: dict[str, Identity | None]) -> Bench:
-    """One ESC on /dev/ttyUSB0."""
+    """Return a bench with one ESC on /dev/ttyUSB0."""
     there[USB0] = LEFT
     return Bench(USB0)
 
 
 USB0, USB1, USB2, USB3 = (f"/dev/ttyUSB{n}" for n in range(4))
-BY_ID, BY_PATH = "/dev/serial/by-id/usb-FTDI", "/dev/serial/by-path/usb-0:1"
-BOTH, TURNED = {USB0: LEFT, USB1: RIGHT}, {USB0: RIGHT, USB1: LEFT}
+BY_ID = "/dev/serial/by-id/usb-FTDI"
+BY_PATH = "/dev/serial/by-path/usb-0:1"
+BOTH = {USB0: LEFT, USB1: RIGHT}
+TURNED = {USB0: RIGHT, USB1: LEFT}
 REPLUGGED: dict[str, tuple[dict[str, Identity], dict[str, Identity], list[str | None]]] = {
     "an adapter under another number is found": ({USB0: LEFT}, {USB3: LEFT}, [USB3]),
-    "two in the other order stay with their ESCs": (BOTH, TURNED, [USB1, USB0]),
+    "two in the other order keep their ESCs": (BOTH, TURNED, [USB1, USB0]),
     "left does not show the values of right": (BOTH, {USB0: RIGHT}, [None, USB0]),
     "one serial number": ({USB0: LEFT, USB1: LEFT}, {USB1: LEFT}, [None, USB1]),
     "another one on the path is a replacement": ({USB0: LEFT}, {USB0: RIGHT}, [USB0]),
     "a stable name by id is followed as it is": ({BY_ID: LEFT}, {USB0: LEFT}, [None]),
     "a stable name by path is followed as it is": ({BY_PATH: LEFT}, {USB0: LEFT}, [None]),
-    "of two that are alike none is guessed": ({USB0: LEFT}, {USB1: LEFT, USB2: LEFT}, [None]),
+    "neither of two identical adapters is chosen": ({USB0: LEFT}, {USB1: LEFT, USB2: LEFT}, [None]),
 }
 
 
 @pytest.mark.parametrize(("before", "after", "found"), REPLUGGED.values(), ids=REPLUGGED.keys())
-def test_after_plugging_in_again_each_esc_has_its_own_adapter(
+def test_each_esc_gets_its_own_adapter_after_replugging(
     there: dict[str, Identity | None],
     before: dict[str, Identity],
     after: dict[str, Identity],
@@ -143,8 +152,9 @@ def test_after_plugging_in_again_each_esc_has_its_own_adapter(
     assert [esc.port and esc.port.path for esc in bench.escs] == found
     for path, esc in zip(found, bench.escs, strict=True):
         assert esc.reopened == (path is not None)
-        assert path is None or f"{esc.name}: {path} is open, after 2.0 s" in caplog.messages
-        assert path is None or esc.identity == after[path]
+        if path is not None:
+            assert f"{esc.name}: {path} is open, after 2.0 s" in caplog.messages
+            assert esc.identity == after[path]
 
 
 def test_an_esc_is_found_by_its_adapter(there: dict[str, Identity | None], bench: Bench) -> None:
@@ -156,8 +166,9 @@ def test_an_esc_is_found_by_its_adapter(there: dict[str, Identity | None], bench
     assert not bench.escs[0].is_at("/dev/ttyUSB1")
 
 
-def test_a_port_is_lost_since_it_was_lost_however_often_it_is_tried(
-    there: dict[str, Identity | None], bench: Bench
+def test_attempts_to_open_do_not_change_since_when_a_port_is_lost(
+    there: dict[str, Identity | None],
+    bench: Bench,
 ) -> None:
     esc = bench.escs[0]
     there.clear()
@@ -172,7 +183,7 @@ def test_a_port_is_lost_since_it_was_lost_however_often_it_is_tried(
     assert esc.facts().lost_since_ns == 7 * SECOND
 
 
-def test_line_errors_are_counted_by_kind_over_every_plugging_in(
+def test_line_errors_are_counted_by_kind_across_replugging(
     bench: Bench,
 ) -> None:
     esc = bench.escs[0]
@@ -184,14 +195,15 @@ def test_line_errors_are_counted_by_kind_over_every_plugging_in(
     bench.reopen(3 * SECOND)
     bench.port().counts = {"parity": 1}
     esc.report(4 * SECOND)
-    assert esc.line_errors["parity"] == 3, "of a new driver's count"
+    assert esc.line_errors["parity"] == 3, "a new driver's count starts again"
     bench.port().counts = {"parity": 9}
     esc.report(5 * SECOND)
     assert bench.gateway.escs[0].line_errors == 13
 
 
-def test_a_diagnosis_is_said_once_and_is_over_while_telemetry_comes(
-    bench: Bench, caplog: pytest.LogCaptureFixture
+def test_a_diagnosis_is_logged_once_and_ends_with_telemetry(
+    bench: Bench,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     esc = bench.escs[0]
@@ -210,12 +222,13 @@ def test_a_diagnosis_is_said_once_and_is_over_while_telemetry_comes(
     esc.serve(21 * SECOND)
     esc.log.follow_link(21 * SECOND)
     assert caplog.messages[-1] == "left: telemetry ok (V4)"
-    assert (esc.log.complaint, esc.facts().diagnosis) == ("", None)
+    assert esc.log.complaint == ""
+    assert esc.facts().diagnosis is None
     for now in range(21 * SECOND, 23 * SECOND, 100 * MS):
         bench.gateway.advance(now)
         esc.report(now)
         if now <= 22200 * MS:
-            assert esc.facts().diagnosis is None, "frames come, or did so a moment ago"
+            assert esc.facts().diagnosis is None, "frames arrive, or arrived just before"
     assert (esc.facts().diagnosis or "").startswith("no bytes")
     for n in range(1, 400):
         now = 24 * SECOND + n * 50 * MS
@@ -227,13 +240,13 @@ def test_a_diagnosis_is_said_once_and_is_over_while_telemetry_comes(
     assert len(said) == 2, "it is said again for another loss"
 
 
-def test_a_port_that_is_unplugged_is_one_line_until_it_is_back(
+def test_an_unplugged_port_is_logged_once_until_it_is_back(
     there: dict[str, Identity | None],
     bench: Bench,
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """And a change of its settings before is not reported afterwards."""
+    """A change of its settings before the loss is not reported after it."""
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     esc = bench.escs[0]
 
@@ -254,12 +267,12 @@ def test_a_port_that_is_unplugged_is_one_line_until_it_is_back(
     ]
 
 
-def test_a_mini_uart_is_a_warning_when_it_is_opened(
+def test_a_mini_uart_causes_a_warning_when_it_is_opened(
     there: dict[str, Identity | None],
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """It opens, and loses frames: it has no parity."""
+    """It opens, but it has no parity and loses frames."""
     monkeypatch.setattr(esc_input, "is_mini_uart", lambda path: path == "/dev/ttyS0")
     there |= {"/dev/ttyS0": None, USB0: LEFT}
     Bench("/dev/ttyS0", USB0)
@@ -268,8 +281,9 @@ def test_a_mini_uart_is_a_warning_when_it_is_opened(
     assert warning.endswith("Use ttyAMA0.")
 
 
-def test_a_loss_is_reported_with_the_errors_that_came_in_it(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_loss_is_reported_with_its_errors(
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     world = World()
@@ -298,7 +312,7 @@ def test_a_loss_is_reported_with_the_errors_that_came_in_it(
     assert "; 3 CRC errors, " in back
 
 
-def test_a_usb_adapter_is_known_by_its_numbers_or_its_place(
+def test_a_usb_adapter_is_identified_by_its_numbers_or_its_location(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     plugged = {
@@ -321,14 +335,15 @@ def test_a_usb_adapter_is_known_by_its_numbers_or_its_place(
     }
 
 
-def test_settings_that_another_program_changes_are_set_again(core_language: str) -> None:
+def test_settings_changed_by_another_program_are_restored(core_language: str) -> None:
     with PtyEsc() as esc:
         port = serial_port.SerialPort(esc.path, KONTRONIK)
 
         def hold() -> bool:
             if core_language == "Python":
                 return port.settings_hold()
-            turns = Gateway([EscSettings()], Layout("", "", ()), 0).core.turns()  # type: ignore[attr-defined]
+            gateway = Gateway([EscSettings()], Layout("", "", ()), 0)
+            turns = gateway.core.turns()  # type: ignore[attr-defined]
             turns.inputs[0].settings[:] = port.settings
             assert turns.watch([(port.fileno(), select.POLLIN, 0)])
             turns.leave()
@@ -357,9 +372,13 @@ def test_settings_are_checked_every_100_ms_while_the_esc_sends(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """While another program has echo on, an ESC receives what it sends. Both cores check equally often."""
+    """While another program has echo on, an ESC receives its own bytes.
+
+    Both cores check equally often.
+    """
     world = World()
-    wire, limit = world.wires[0], 125 * MS if speaks else 170 * MS
+    wire = world.wires[0]
+    limit = 125 * MS if speaks else 170 * MS
     loop = loop_in(world, monkeypatch)
     loop.open()
     loop.begin()
@@ -367,7 +386,8 @@ def test_settings_are_checked_every_100_ms_while_the_esc_sends(
     if speaks:
         wire.stream(begin, begin + 3 * SECOND, 20 * MS)
     run(loop, world, begin + 1300 * MS)
-    changed, wire.now_set = world.now, bytes(64)
+    changed = world.now
+    wire.now_set = bytes(64)
     run(loop, world, begin + 3 * SECOND)
     loop.close()
     assert wire.now_set == wire.settings
@@ -379,10 +399,12 @@ def test_settings_are_checked_every_100_ms_while_the_esc_sends(
 
 
 @pytest.mark.parametrize("hangs_up", [False, True])
-def test_a_port_that_cannot_be_read_is_lost_in_that_turn_and_the_others_are_read(
-    hangs_up: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_an_unreadable_port_is_lost_in_that_turn_and_others_are_read(
+    hangs_up: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Both ports are ready at that moment."""
+    """Both ports are readable in that turn."""
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     world = World(2)
     failing, sound = world.wires
@@ -406,22 +428,21 @@ def test_a_port_that_cannot_be_read_is_lost_in_that_turn_and_the_others_are_read
     loop.close()
     assert loop.gateway.escs[1].counters.live == len(sound.frames)
     assert loop.escs[0].reopened == 1
-    shown_later = [
-        at for at, frame in world.bus.sent if frame.can_id == 0x100 and at > failed + SECOND
-    ]
-    assert shown_later
+    shown_at = [at for at, frame in world.bus.sent if frame.can_id == 0x100]
+    assert any(at > failed + SECOND for at in shown_at)
 
 
-def test_pauses_between_attempts_grow_until_a_port_has_given_bytes(
+def test_pauses_between_attempts_grow_until_a_port_receives_bytes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A port that is lost again before a byte came is tried less and less often, up to a second."""
+    """If a port is lost before its first byte, the pause doubles, up to a second."""
     world = World()
     (wire,) = world.wires
     loop = loop_in(world, monkeypatch)
     loop.open()
     loop.begin()
-    opened, open_port = list[int](), loop.escs[0].open
+    opened = list[int]()
+    open_port = loop.escs[0].open
 
     def note_and_open(*arguments: Any) -> None:
         opened.append(world.now)
@@ -445,9 +466,10 @@ def test_pauses_between_attempts_grow_until_a_port_has_given_bytes(
     loop.close()
 
 
-def test_echo_is_off_before_anything_else_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A terminal that was just made echoes; what comes before that is off goes back to the ESC."""
-    real, echoes = serial_port._open, []
+def test_echo_is_switched_off_before_anything_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new terminal echoes. Bytes that arrive before echo is off are sent back to the ESC."""
+    real = serial_port._open
+    echoes = []
     with PtyEsc() as esc:
 
         def switch(on: bool) -> None:
@@ -456,37 +478,41 @@ def test_echo_is_off_before_anything_else_is_done(monkeypatch: pytest.MonkeyPatc
             termios.tcsetattr(esc.fileno(), termios.TCSANOW, mode)
 
         def opened(path: str, *more: Any) -> Any:
-            links = [os.readlink(link) for link in Path("/proc/self/fd").glob("*") if link.exists()]
             echoes.append(termios.tcgetattr(esc.fileno())[3] & termios.ECHO)
-            assert links.count(esc.path) > before, "held open: else it may echo again"
+            assert count_descriptors() > before, "the port is held open: it may echo again else"
             return real(path, *more)
+
+        def count_descriptors() -> int:
+            descriptors = Path("/proc/self/fd").glob("*")
+            links = [os.readlink(link) for link in descriptors if link.exists()]
+            return links.count(esc.path)
 
         monkeypatch.setattr(serial_port, "_open", opened)
         switch(True)
-        links = [os.readlink(link) for link in Path("/proc/self/fd").glob("*") if link.exists()]
-        before = links.count(esc.path)
+        before = count_descriptors()
         serial_port.SerialPort(esc.path, KONTRONIK).close()
     assert echoes == [0]
 
 
-def test_an_adapter_pulled_out_while_it_is_set_is_one_line(
+def test_an_adapter_unplugged_while_it_is_set_up_is_a_plain_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     opened = serial_port._open
 
     def gone(*arguments: Any) -> Any:
         port = opened(*arguments)
-        monkeypatch.setattr(
-            termios, "tcgetattr", lambda _fd: (_ for _ in ()).throw(termios.error(errno.EIO, "I/O"))
-        )
+        monkeypatch.setattr(termios, "tcgetattr", fail)
         return port
+
+    def fail(_fd: int) -> None:
+        raise termios.error(errno.EIO, "I/O")
 
     monkeypatch.setattr(serial_port, "_open", gone)
     with PtyEsc() as esc, pytest.raises(RunError, match="cannot be opened"):
         serial_port.SerialPort(esc.path, KONTRONIK)
 
 
-def test_the_mini_uart_of_a_raspberry_pi_is_known_by_its_device_tree(tmp_path: Path) -> None:
+def test_a_raspberry_pis_mini_uart_is_recognised_by_its_device_tree(tmp_path: Path) -> None:
     device = tmp_path / "sys/devices/platform/soc/3f215040.serial"
     (device / "of_node").mkdir(parents=True)
     (device / "of_node/compatible").write_bytes(b"brcm,bcm2835-aux-uart\0")

@@ -1,4 +1,7 @@
-"""The hot path makes no garbage in circles: with the collector off, thousands of frames leave nothing that only it could find."""
+"""The hot path creates no reference cycles.
+
+With the collector off, thousands of frames leave no garbage that only the collector could find.
+"""
 
 import gc
 from collections.abc import Iterator
@@ -16,11 +19,11 @@ from kontronik_can_gw.runtime.status.snapshot import snapshot
 from kontronik_can_gw.times import MS, SECOND
 
 EVERYTHING = made(2, canopen=True, dronecan={"node_id": 40, "enabled": True})
-"""Two ESCs, with messages, CANopen nodes and one of DroneCAN."""
+"""Setup and layout of two ESCs with messages, CANopen nodes and a DroneCAN node."""
 
 
 def garbage() -> list[str]:
-    """What only the collector finds now, each by its type and text."""
+    """Return the objects that only the collector finds, each by its type and text."""
     gc.set_debug(gc.DEBUG_SAVEALL)
     try:
         gc.collect()
@@ -32,7 +35,7 @@ def garbage() -> list[str]:
 
 @contextmanager
 def collector_off() -> Iterator[None]:
-    """Nothing is collected inside, and what was left over before is away."""
+    """Collect the garbage so far, then switch the collector off within the block."""
     gc.collect()
     gc.disable()
     try:
@@ -42,14 +45,16 @@ def collector_off() -> Iterator[None]:
 
 
 def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> None:
-    """Live and info frames, damaged ones, an unplugged port, a bus in trouble, a master."""
+    """Live, info and damaged frames, an unplugged port, a faulty bus and a master occur."""
     recorder = Recorder(tmp_path, RecordConfig())
     recorder.start()
     assert recorder._worker.stop(60)
     bench = Bench(*EVERYTHING)
     running = bench.running(7)
-    running(2)  # the nodes boot, and what is made once is made
-    before, written, begun = None, 0, len(bench.sent)
+    running(2)  # the nodes boot, and objects that are created once are created
+    before = None
+    written = 0
+    begun = len(bench.sent)
     with collector_off():
         for _ in range(40):
             entries = len(bench.entries)
@@ -61,7 +66,7 @@ def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> Non
             moment = moment_of(bench.gateway, now)
             written += len(snapshot(moment, before))
             before = moment
-        recorder._work([])  # what the thread does each half second; it has ended
+        recorder._work([])  # the thread would do this each half second, but it has ended
         assert garbage() == []
     recorder.close()
     assert len(bench.sent) - begun > 3000
@@ -71,7 +76,7 @@ def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> Non
 
 
 def test_the_loop_leaves_no_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With its ports, conditions and the CAN side; lines that fall silent and speak again, a process that is held up."""
+    """The loop has ports, conditions and a CAN side. Lines stop and resume, and it is held up."""
     setup, layout = EVERYTHING
     world = World(2)
     loop = loop_in(world, monkeypatch, setup.escs, layout, outputs=setup.outputs)

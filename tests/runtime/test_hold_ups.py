@@ -1,6 +1,6 @@
-"""What a process that was held up shows: no value is older than its time-out, and none that is fresh is lost.
+"""A process that was held up sends no value older than its time-out, and loses no fresh one.
 
-On the CAN side: commands that waited are obeyed, answers are sent, measurements are made anew.
+On the CAN side it obeys commands that waited, sends the answers, and computes measurements again.
 """
 
 import errno
@@ -48,12 +48,12 @@ NS_PER_BYTE = KONTRONIK.byte_ns
 
 
 def shown(frame: CanFrame) -> tuple[int, int]:
-    """(number of the ESC's frame, age in ms)."""
+    """Return the number of the ESC's frame and its age in ms."""
     return int.from_bytes(frame.data[:4], "little"), int.from_bytes(frame.data[4:6], "little")
 
 
 def values(world: World, esc: int = 0) -> Iterator[tuple[int, int, int]]:
-    """(time, number, age in ms) of what was sent while there was a value."""
+    """Yield time, number and age in ms of the frames that were sent with a value."""
     for at, frame in world.bus.sent:
         number, age = shown(frame)
         if frame.can_id == 0x100 + esc and number != NOT_AVAILABLE:
@@ -71,7 +71,7 @@ TWO = (EscSettings("esc1", timeout_ns=20 * MS), EscSettings("esc2"))
 LAYOUTS = {count: layout_of(TWO[:count]) for count in (1, 2)}
 
 
-@settings(max_examples=25, deadline=None, phases=[Phase.generate])  # a seed cannot be made simpler
+@settings(max_examples=25, deadline=None, phases=[Phase.generate])  # a seed cannot be shrunk
 @given(
     st.integers(0, 2**32),
     st.sampled_from([20, 60, 100, 250, 1000]),
@@ -80,24 +80,35 @@ LAYOUTS = {count: layout_of(TWO[:count]) for count in (1, 2)}
     st.booleans(),
     st.booleans(),
 )
-def test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true(
-    seed: int, timeout_ms: int, period_ms: int, stops: float, neighbour: bool, bundled: bool
+def test_after_any_hold_up_values_end_in_time_and_ages_are_true(
+    seed: int,
+    timeout_ms: int,
+    period_ms: int,
+    stops: float,
+    neighbour: bool,
+    bundled: bool,
 ) -> None:
     rng = random.Random(seed)
     world = World(1 + neighbour)
-    wire, start = world.wires[0], world.now
-    timeout, period = timeout_ms * MS, period_ms * MS
+    wire = world.wires[0]
+    start = world.now
+    timeout = timeout_ms * MS
+    period = period_ms * MS
     escs = (EscSettings("esc1", timeout_ns=timeout), TWO[1])[: 1 + neighbour]
     at = start + rng.randrange(period)
     while at < start + 4 * SECOND:
         wire.send(at, bundled)
-        gap = rng.random() < 0.01
-        at += max(4 * MS, period + (rng.randrange(2 * timeout) if gap else rng.randrange(-MS, MS)))
+        has_gap = rng.random() < 0.01
+        jitter = rng.randrange(2 * timeout) if has_gap else rng.randrange(-MS, MS)
+        at += max(4 * MS, period + jitter)
     if neighbour:
         world.wires[1].stream(start, start + 4 * SECOND, 17 * MS)
-    world.hold_up = lambda: (
-        rng.randrange(400 * MS) if rng.random() < stops else rng.randrange(MS // 10)
-    )
+
+    def hold_up() -> int:
+        is_stopped = rng.random() < stops
+        return rng.randrange(400 * MS if is_stopped else MS // 10)
+
+    world.hold_up = hold_up
     with pytest.MonkeyPatch.context() as patch:
         loop = loop_in(world, patch, escs, LAYOUTS[len(escs)])
         loop.open()
@@ -106,17 +117,19 @@ def test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true(
         while world.now < start + 5 * SECOND:
             losses = loop.gateway.escs[0].losses
             loop.turn()
-            lost += [(world.now, world.looks[-2])] * (loop.gateway.escs[0].losses - losses)
+            new_losses = loop.gateway.escs[0].losses - losses
+            lost += [(world.now, world.looks[-2])] * new_losses
         loop.close()
     for sent, number, age in values(world):
         truth = sent - wire.frames[number - 1]
-        if bundled:  # what the adapter held back came sooner than the wire allows
+        if bundled:  # bytes that the adapter held back arrive faster than the wire allows
             truth -= 40 * NS_PER_BYTE
         assert truth <= timeout
         # ages are shown in whole ms, the period has jitter
         assert (age + 1) * MS >= truth - period - 2 * MS
     for when, looked in lost:
-        # none is given up earlier than by the time between the two looks between which it came
+        # The frame arrived between two checks of the port. The loss may be found earlier than
+        # the time-out by the time between these two checks.
         newest = max(whole for whole in wire.frames if whole <= looked)
         look = bisect_left(world.looks, newest)
         between = world.looks[look] - world.looks[look - 1]
@@ -125,10 +138,11 @@ def test_whatever_holds_the_process_up_values_end_in_time_and_ages_are_true(
 
 
 @pytest.mark.parametrize("sends", [True, False])
-def test_the_loop_looks_at_its_ports_four_times_within_the_shortest_time_out_whatever_a_master_makes_of_it(
-    monkeypatch: pytest.MonkeyPatch, sends: bool
+def test_the_loop_checks_its_ports_four_times_per_shortest_time_out(
+    monkeypatch: pytest.MonkeyPatch,
+    sends: bool,
 ) -> None:
-    """No message wakes it besides, and no more often than that."""
+    """A master may change the time-out. No message wakes the loop, and it does not check more."""
     world = World(2)
     escs = (EscSettings("esc1", timeout_ns=SECOND), EscSettings("esc2"))
     loop = loop_in(world, monkeypatch, escs, Layout("", "", ()))
@@ -150,17 +164,21 @@ def test_the_loop_looks_at_its_ports_four_times_within_the_shortest_time_out_wha
 
 
 @pytest.mark.parametrize("interrupted", ["no poll", "polls of ports that were read", "all polls"])
-def test_what_waited_beyond_one_read_is_dated_by_its_place(
-    monkeypatch: pytest.MonkeyPatch, interrupted: str
+def test_bytes_beyond_one_read_are_dated_by_their_position(
+    monkeypatch: pytest.MonkeyPatch,
+    interrupted: str,
 ) -> None:
-    """A poll in C that a signal interrupts does not tell that a port is empty."""
+    """If a signal interrupts a poll in C, the poll does not show that a port is empty."""
     world = World()
     (wire,) = world.wires
     start = world.now
     if interrupted != "no poll":
-        world.poll_fault = lambda is_all: (
-            errno.EINTR if interrupted == "all polls" or not is_all else 0
-        )
+
+        def poll_fault(is_all: bool) -> int:
+            is_interrupted = interrupted == "all polls" or not is_all
+            return errno.EINTR if is_interrupted else 0
+
+        world.poll_fault = poll_fault
     loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=20 * SECOND))
     wire.stream(start, start + 8 * SECOND, 40 * NS_PER_BYTE)  # without a pause: 83 kB
     world.now += 9 * SECOND
@@ -174,13 +192,17 @@ def test_what_waited_beyond_one_read_is_dated_by_its_place(
     assert abs(wire.frames[-1] - esc.live_bound_ns) <= NS_PER_BYTE
 
 
-def test_a_port_that_always_has_bytes_keeps_no_other_one_waiting(
+def test_a_port_that_always_has_bytes_does_not_delay_other_ports(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A megabyte waits at one, of which 4 KiB take the process a millisecond; each frame of the other is shown two reads later at most."""
+    """Each frame of the other port is sent at most two reads later.
+
+    A megabyte waits at the first port, and the process needs a millisecond for 4 KiB.
+    """
     world = World(2)
     flooded, usual = world.wires
-    start, read = world.now, flooded.read
+    start = world.now
+    read = flooded.read
 
     def slow_read(most: int = 4096) -> bytes:
         data = read(most)
@@ -196,14 +218,16 @@ def test_a_port_that_always_has_bytes_keeps_no_other_one_waiting(
     assert flooded.waiting > 1 << 16
     first = {number: at for at, number, _ in reversed(list(values(world, 1)))}
     assert list(range(1, 21)) == sorted(first)
-    assert all(first[n + 1] - whole <= 2 * MS for n, whole in enumerate(usual.frames))
+    for number, whole in enumerate(usual.frames, 1):
+        assert first[number] - whole <= 2 * MS
 
 
 @pytest.mark.parametrize("is_reopened", [False, True])
-def test_a_frame_that_waits_in_a_port_when_it_is_opened_is_never_shown(
-    monkeypatch: pytest.MonkeyPatch, is_reopened: bool
+def test_a_frame_that_waits_in_a_newly_opened_port_is_never_sent(
+    monkeypatch: pytest.MonkeyPatch,
+    is_reopened: bool,
 ) -> None:
-    """Nothing tells how old it is."""
+    """The age of such a frame is unknown."""
     world = World()
     (wire,) = world.wires
     if not is_reopened:
@@ -226,28 +250,29 @@ def test_a_frame_that_waits_in_a_port_when_it_is_opened_is_never_shown(
 
 
 MANY = [Msg(f"M{n}", 0x100 + n, 8, speed_and_age()) for n in range(100)]
-"""More messages than one call of the kernel takes from the core in C: 64."""
+"""More messages than one system call of the C core hands over, which is 64."""
 
 
 def shown_of_all(world: World) -> Iterator[tuple[int, int, int, int]]:
-    """(id, time, number, age in ms) of every frame that was sent with a value."""
+    """Yield id, time, number and age in ms of every frame that was sent with a value."""
     for at, frame in world.bus.sent:
         number, age = shown(frame)
         if number != NOT_AVAILABLE:
             yield frame.can_id, at, number, age
 
 
-def test_bytes_that_come_faster_than_the_wire_allows_are_not_of_the_future(
+def test_bytes_faster_than_the_wire_allows_are_not_dated_in_the_future(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """More than two reads at once, as from a device that is no ESC; a frame is at the end."""
+    """More than two reads arrive at once, as from another device. A frame is at the end."""
     world = World()
     (wire,) = world.wires
     timeout = 100 * MS
     loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=timeout))
     wire.stream(world.now, world.now + 400 * MS, 20 * MS)
     run(loop, world, world.now + SECOND)
-    came, number = world.now + MS, len(wire.frames) + 1
+    came = world.now + MS
+    number = len(wire.frames) + 1
     flood = bytes(10_000) + live(number)
     wire.put(flood, [came] * len(flood))
     wire.frames.append(came)
@@ -259,7 +284,7 @@ def test_bytes_that_come_faster_than_the_wire_allows_are_not_of_the_future(
     assert came <= sent[0] < sent[-1] <= came + timeout
 
 
-def test_bytes_left_in_a_lost_port_do_not_age_the_first_ones_of_the_next(
+def test_bytes_left_in_a_lost_port_do_not_age_the_bytes_after_reopening(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World()
@@ -268,7 +293,8 @@ def test_bytes_left_in_a_lost_port_do_not_age_the_first_ones_of_the_next(
     wire.send(world.now)
     run(loop, world, world.now + 100 * MS)
     wire.put(bytes(5000), [world.now] * 5000)
-    lost, read = world.now, wire.read
+    lost = world.now
+    read = wire.read
 
     def read_once(most: int = 4096) -> bytes:
         data = read(most)
@@ -288,10 +314,11 @@ def test_bytes_left_in_a_lost_port_do_not_age_the_first_ones_of_the_next(
     assert at - 300 * MS < esc.live_bound_ns <= wire.frames[-1]
 
 
-def test_a_hold_up_is_one_line_in_the_log(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_hold_up_is_logged_in_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Delays that are shorter than the shortest time-out are none."""
+    """Delays that are shorter than the shortest time-out are not logged."""
     world = World()
     start = world.now
     loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=100 * MS))
@@ -311,20 +338,24 @@ def test_a_hold_up_is_one_line_in_the_log(
 
 
 @pytest.mark.parametrize("frames_before", [0, 64])
-def test_frames_that_become_old_while_they_are_handed_over_are_made_anew(
-    monkeypatch: pytest.MonkeyPatch, frames_before: int
+def test_frames_that_become_old_while_being_sent_are_computed_again(
+    monkeypatch: pytest.MonkeyPatch,
+    frames_before: int,
 ) -> None:
-    """The process is held up behind the read, or when the kernel has taken 64 of 100 frames."""
+    """The process is held up after the read, or when the kernel has taken 64 of 100 frames."""
     world = World()
     (wire,) = world.wires
-    start, hold_up, read = world.now, 300 * MS, wire.read
+    start = world.now
+    hold_up = 300 * MS
+    read = wire.read
     escs = (EscSettings("esc1", timeout_ns=SECOND),)
     loop = loop_in(world, monkeypatch, escs, compiled(dbc_text(MANY, TIMES)))
     loop.open()
     loop.begin()
     wire.stream(start, start + SECOND, 100 * MS)
     run(loop, world, start + SECOND)
-    held, sent = len(wire.frames) + 1, 0
+    held = len(wire.frames) + 1
+    sent = 0
 
     def slow_read(most: int = 4096) -> bytes:
         data = read(most)
@@ -357,13 +388,15 @@ def test_frames_that_become_old_while_they_are_handed_over_are_made_anew(
         assert 0 <= at - whole - age * MS < 2 * MS
 
 
-def test_a_bus_that_takes_a_part_of_what_is_handed_over_gets_the_rest(
-    monkeypatch: pytest.MonkeyPatch, core_language: str
+def test_a_bus_that_takes_only_some_frames_gets_the_others_later(
+    monkeypatch: pytest.MonkeyPatch,
+    core_language: str,
 ) -> None:
-    """The kernel takes six of 25 frames at once. The others follow before the next values."""
+    """The kernel takes six of 25 frames at once. The others are sent before the next values."""
     world = World()
     (wire,) = world.wires
-    start, period = world.now, 50 * MS
+    start = world.now
+    period = 50 * MS
     messages = MANY[:25]
     world.bus.frame_ns = 200_000
     layout = compiled(dbc_text(messages, TIMES.replace("20", "1000")))
@@ -379,31 +412,41 @@ def test_a_bus_that_takes_a_part_of_what_is_handed_over_gets_the_rest(
     assert status.dropped_frames == 0
     found = list(shown_of_all(world))
     for number, whole in enumerate(wire.frames, 1):
-        in_time = {
-            can_id
-            for can_id, at, shown_number, _ in found
-            if shown_number == number and at < whole + period // 2
-        }
+        in_time = set()
+        for can_id, at, shown_number, _ in found:
+            if shown_number == number and at < whole + period // 2:
+                in_time.add(can_id)
         assert in_time == {message.can_id for message in messages}
     if core_language == "C":
         assert cast("NativePoller", loop._poller).count > 500
 
 
-@pytest.mark.parametrize("blind", [set(), {1000}, {CAN_FD}, {1000, CAN_FD}])
-def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
-    monkeypatch: pytest.MonkeyPatch, blind: set[int]
+@pytest.mark.parametrize(
+    "blind",
+    [
+        set(),
+        {1000},
+        {CAN_FD},
+        {1000, CAN_FD},
+    ],
+)
+def test_the_watchdog_is_fed_only_while_everything_is_served(
+    monkeypatch: pytest.MonkeyPatch,
+    blind: set[int],
 ) -> None:
     world = World()
     fed: list[int] = []
     signs = SimpleNamespace(present=True, watchdog_ns=500 * MS, ready=lambda _: None)
-    signs.status, signs.watchdog = signs.ready, lambda: fed.append(world.now)
+    signs.status = signs.ready
+    signs.watchdog = lambda: fed.append(world.now)
     escs = (EscSettings("esc1", timeout_ns=60 * SECOND),)
     loop = loop_in(world, monkeypatch, escs, notifier=signs)  # type: ignore[arg-type]
     loop.open()
     loop.begin()
     begin = world.now
-    run(loop, world, begin + 5 * SECOND)  # on a silent line, for which the loop need not wake
-    middle, end = world.now, world.now + 10 * SECOND
+    run(loop, world, begin + 5 * SECOND)  # the line is silent, so the loop need not wake for it
+    middle = world.now
+    end = world.now + 10 * SECOND
     world.wires[0].stream(middle, end, 20 * MS)
     for at in range(middle, end, 50 * MS):
         world.bus.came(0x100, b"", at)
@@ -413,20 +456,25 @@ def test_the_watchdog_is_fed_while_all_is_served_and_no_longer(
     run(loop, world, end)
     loop.close()
     last = [at for at in fed if at > middle + 4200 * MS]
-    assert len(last) == 0 if blind else len(last) > 8
+    if blind:
+        assert len(last) == 0
+    else:
+        assert len(last) > 8
 
 
-def test_bytes_that_came_while_the_interface_was_tried_are_old(
+def test_bytes_received_while_the_interface_was_opened_are_old(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World()
     (wire,) = world.wires
     start = world.now
-    world.there, world.opening_ns = False, 400 * MS
+    world.there = False
+    world.opening_ns = 400 * MS
     loop = begin(monkeypatch, world, EscSettings("esc1"))
     wire.stream(start + 410 * MS, start + 2 * SECOND, 100 * MS)
     run(loop, world, start + 2 * SECOND)
-    world.there, world.opening_ns = True, 100 * MS
+    world.there = True
+    world.opening_ns = 100 * MS
     run(loop, world, start + 4 * SECOND)
     wire.send(world.now)
     run(loop, world, world.now + 50 * MS)
@@ -434,12 +482,17 @@ def test_bytes_that_came_while_the_interface_was_tried_are_old(
     assert {number for _, number, _ in values(world)} == {len(wire.frames)}
 
 
-def test_a_bus_that_is_slower_than_what_comes_has_the_newest_values_in_order(
-    monkeypatch: pytest.MonkeyPatch, core_language: str
+def test_a_slow_bus_gets_the_newest_values_in_order(
+    monkeypatch: pytest.MonkeyPatch,
+    core_language: str,
 ) -> None:
-    """Four ESCs whose frames come together; the kernel takes six frames in advance. In C hardly a turn comes back for it."""
+    """The frames of four ESCs arrive together, and the kernel takes six frames in advance.
+
+    The C core sends them in the background: hardly a turn of the loop is needed for it.
+    """
     world = World(4)
-    start, end = world.now, world.now + 3 * SECOND
+    start = world.now
+    end = world.now + 3 * SECOND
     world.bus.frame_ns = 1_900_000
     for number, wire in enumerate(world.wires):
         wire.stream(start + number * 100_000, end, 10 * MS)
@@ -463,13 +516,19 @@ def test_a_bus_that_is_slower_than_what_comes_has_the_newest_values_in_order(
 
 
 @pytest.mark.parametrize("clock_error_s", [-3600, 3600])
-def test_a_frame_that_came_in_a_hold_up_is_as_old_as_it_is(
-    monkeypatch: pytest.MonkeyPatch, clock_error_s: int
+def test_a_frame_received_in_a_hold_up_has_its_true_age(
+    monkeypatch: pytest.MonkeyPatch,
+    clock_error_s: int,
 ) -> None:
-    """However the wall clock was set meanwhile: it came between the two looks at the bus."""
-    world, shown_at = World(), list[int]()
+    """The wall clock may be set meanwhile. The frame arrived between two checks of the bus."""
+    world = World()
+    shown_at = list[int]()
     loop = begin(monkeypatch, world, EscSettings("esc1"))
-    monkeypatch.setattr(loop.gateway, "receive_frame", lambda _frame, _now, at: shown_at.append(at))
+
+    def note_time(_frame: CanFrame, _now: int, at: int) -> None:
+        shown_at.append(at)
+
+    monkeypatch.setattr(loop.gateway, "receive_frame", note_time)
     world.bus.clock_error = clock_error_s * SECOND
     world.wires[0].stream(world.now, world.now + 2 * SECOND, 10 * MS)
     for _ in range(5):
@@ -489,15 +548,19 @@ def test_a_frame_that_came_in_a_hold_up_is_as_old_as_it_is(
 
 
 HELD_UP_NS = 400 * MS
-REQUEST, ANSWER, EMCY, HEARTBEAT, TPDO = 0x601, 0x581, 0x081, 0x701, 0x181
+REQUEST = 0x601
+ANSWER = 0x581
+EMCY = 0x081
+HEARTBEAT = 0x701
+TPDO = 0x181
 SPEED = 0x688
 ZEROS = "00 00 00 00"
 WATCH = ("23 16 10 01 2c 01 05 00", "2f 29 10 01 01 00 00 00", "2b 00 21 04 60 ea 00 00")
-"""Node 5: 300 ms; its loss changes no state; and telemetry is not lost for 60 s."""
+"""SDO requests: watch node 5 for 300 ms, keep the state at its loss, time-out of the ESC 60 s."""
 
 
 class Bench:
-    """A gateway with a CANopen node 1 that runs, and telemetry of 100 Hz."""
+    """A gateway with a running CANopen node 1, and telemetry of 100 Hz."""
 
     def __init__(self, patch: pytest.MonkeyPatch, opening_ns: int = 0) -> None:
         self.world = World()
@@ -521,7 +584,7 @@ class Bench:
         run(self.loop, self.world, self.world.now + ns)
 
     def ask(self, request: str) -> str:
-        """An SDO request and its answer."""
+        """Send an SDO request. Return the answer in hex."""
         self.take()
         self.world.bus.came(REQUEST, bytes.fromhex(request))
         self.run(20 * MS)
@@ -570,10 +633,16 @@ def of(frames: list[tuple[int, bytes]], *ids: int) -> list[tuple[int, str]]:
         (0x7E5, f"04 01 00 00 {ZEROS}", 0x7E4, f"5e 01 00 00 {ZEROS}", NmtState.OPERATIONAL),
     ],
 )
-def test_a_command_that_waited_is_obeyed_and_answered_once(
-    bench: Bench, can_id: int, request_hex: str, answer_id: int, answer: str, state: NmtState
+def test_a_waiting_command_is_obeyed_and_answered_once(
+    bench: Bench,
+    can_id: int,
+    request_hex: str,
+    answer_id: int,
+    answer: str,
+    state: NmtState,
 ) -> None:
-    bus, now = bench.world.bus, bench.world.now
+    bus = bench.world.bus
+    now = bench.world.now
     bus.came(can_id, bytes.fromhex(request_hex), now + MS)
     if can_id == 0x7E5:
         bus.came(can_id, bytes.fromhex(f"5e 00 00 00 {ZEROS}"), now + 2 * MS)
@@ -583,7 +652,7 @@ def test_a_command_that_waited_is_obeyed_and_answered_once(
     assert bench.state is state
 
 
-def test_an_interface_that_opens_slowly_is_no_hold_up(
+def test_an_interface_that_opens_slowly_is_not_a_hold_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = Bench(monkeypatch, opening_ns=HELD_UP_NS)
@@ -596,10 +665,10 @@ def test_an_interface_that_opens_slowly_is_no_hold_up(
     made.loop.close()
 
 
-def test_syncs_that_waited_are_counted_and_not_answered(bench: Bench) -> None:
+def test_waiting_syncs_are_counted_and_not_answered(bench: Bench) -> None:
     bench.write(
-        "23 00 18 01 81 01 00 c0",  # 1800h:1: off
-        "2f 00 18 02 02 00 00 00",  # each second SYNC
+        "23 00 18 01 81 01 00 c0",  # 1800h:1: invalid
+        "2f 00 18 02 02 00 00 00",  # at each second SYNC
         "23 00 18 01 81 01 00 40",
     )
     sync = 0x80
@@ -610,9 +679,7 @@ def test_syncs_that_waited_are_counted_and_not_answered(bench: Bench) -> None:
     assert of(bench.take(), TPDO) == []
     bench.world.bus.came(sync)
     bench.run(10 * MS)
-    assert len(of(bench.take(), TPDO)) == 1, (
-        "the fourth is an even one: those that waited were counted"
-    )
+    assert len(of(bench.take(), TPDO)) == 1, "the fourth SYNC is even: waiting ones were counted"
     for expected in (0, 1):
         bench.world.bus.came(sync)
         bench.run(10 * MS)
@@ -622,22 +689,26 @@ def test_syncs_that_waited_are_counted_and_not_answered(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("came_ms", "codes"),
     [
-        (range(50, 2000, 50), []),  # all the time, as the kernel knows
-        ([100, *range(700, 2000, 50)], ["3081", "0000"]),  # it stayed away for 600 ms
+        (range(50, 2000, 50), []),  # all the time, by the times of the kernel
+        ([100, *range(700, 2000, 50)], ["3081", "0000"]),  # missing for 600 ms
         ([100, 200, 300], ["3081"]),
         ([], ["3081"]),
     ],
 )
-def test_heartbeats_count_when_they_came(
-    bench: Bench, came_ms: Iterable[int], codes: list[str]
+def test_heartbeats_are_judged_by_the_time_of_their_arrival(
+    bench: Bench,
+    came_ms: Iterable[int],
+    codes: list[str],
 ) -> None:
-    """Held up for the first second. Beside them comes more than one call reads."""
+    """The process is held up for the first second. More frames wait than one call reads."""
     bench.write(*WATCH)
     bench.world.bus.came(0x705, b"\x05")
     bench.run(10 * MS)
-    others = [(n, REQUEST, bytes((0x80, 0, 0, 0, 0, 0, 0, 0))) for n in range(900)]
+    abort = bytes((0x80, 0, 0, 0, 0, 0, 0, 0))
+    frames = [(ms, REQUEST, abort) for ms in range(900)]
+    frames += [(ms, 0x705, b"\x05") for ms in came_ms]
     start = bench.world.now
-    for ms, can_id, data in sorted([*others, *((ms, 0x705, b"\x05") for ms in came_ms)]):
+    for ms, can_id, data in sorted(frames):
         bench.world.bus.came(can_id, data, start + ms * MS)
     bench.hold_up(SECOND)
     bench.run(900 * MS)
@@ -645,9 +716,9 @@ def test_heartbeats_count_when_they_came(
     assert [data[:2].hex() for data in emergencies] == codes
 
 
-def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench: Bench) -> None:
+def test_waiting_answers_are_kept_and_measurements_are_computed_again(bench: Bench) -> None:
     bus = bench.world.bus
-    bench.write(*WATCH)  # nothing is sent because telemetry is lost
+    bench.write(*WATCH)  # no loss of telemetry causes a frame
     bus.answer = Sent.BUSY
     for n in range(5):
         bus.came(REQUEST, bytes((0x40, n, 0x99, 0, 0, 0, 0, 0)))
@@ -665,11 +736,12 @@ def test_what_waits_to_be_sent_answers_stay_and_measurements_are_made_anew(bench
     speeds = {int.from_bytes(data[:3], "little") for can_id, data in sent if can_id == SPEED}
     assert speeds == {old + 1}
     dbc = {message.can_id for message in bench.layout.messages if message.cycle_ns <= HELD_UP_NS}
-    assert dbc <= {can_id for can_id, _ in sent}, "what was dropped is made anew at once"
-    assert 0x123 not in {can_id for can_id, _ in sent}, "what nothing replaces is dropped too"
+    sent_ids = {can_id for can_id, _ in sent}
+    assert dbc <= sent_ids, "dropped messages are computed again immediately"
+    assert 0x123 not in sent_ids, "a frame without a replacement is dropped too"
 
 
-def test_within_a_turn_the_rest_is_late_but_answers_are_not_lost(
+def test_a_hold_up_within_a_turn_discards_values_but_no_answers(
     bench: Bench,
 ) -> None:
     world = bench.world
@@ -691,19 +763,19 @@ def test_within_a_turn_the_rest_is_late_but_answers_are_not_lost(
     sent = [(at, frame.can_id, frame.data) for at, frame in world.bus.sent]
     late = [(can_id, data) for at, can_id, data in sent if at > world.now - SECOND]
     assert [data[1] for _, can_id, data in sent if can_id == ANSWER] == list(range(5))
-    assert [
-        can_id
-        for can_id, data in late
-        if int.from_bytes(data[:3], "little") == number and can_id == SPEED
-    ] == []
-    assert any(can_id == SPEED for can_id, _ in late), "and told that there is nothing"
+    late_speeds = [int.from_bytes(data[:3], "little") for can_id, data in late if can_id == SPEED]
+    assert number not in late_speeds
+    assert late_speeds, "a frame that marks the value as not available is sent"
 
 
-LOST, UNDERVOLTAGE, SYNC_LENGTH, HEARTBEAT_LOST = "1075", "2032", "4082", "3081"
+LOST = "1075"
+UNDERVOLTAGE = "2032"
+SYNC_LENGTH = "4082"
+HEARTBEAT_LOST = "3081"
 
 
 def emergencies(bench: Bench) -> list[str]:
-    """The codes of the emergencies that were sent, as they are on the bus."""
+    """Return the codes of the emergencies that were sent, in the byte order of the bus."""
     return [data[:2].hex() for can_id, data in bench.take() if can_id == EMCY]
 
 
@@ -711,10 +783,12 @@ def emergencies(bench: Bench) -> list[str]:
     ("came_ms", "codes"),
     [(100, [SYNC_LENGTH, LOST]), (380, [LOST, SYNC_LENGTH])],
 )
-def test_an_emergency_of_a_hold_up_has_the_place_of_its_time(
-    bench: Bench, came_ms: int, codes: list[str]
+def test_emergencies_of_a_hold_up_are_sent_in_order_of_time(
+    bench: Bench,
+    came_ms: int,
+    codes: list[str],
 ) -> None:
-    """Telemetry ends with the hold-up and is lost 250 ms later."""
+    """Telemetry ends when the hold-up begins, and is lost 250 ms later."""
     bench.world.bus.came(0x80, b"\x01", bench.world.now + came_ms * MS)
     bench.hold_up()
     assert emergencies(bench) == codes
@@ -723,7 +797,7 @@ def test_an_emergency_of_a_hold_up_has_the_place_of_its_time(
 
 
 def test_an_error_of_the_esc_in_a_hold_up_precedes_the_loss(bench: Bench) -> None:
-    """The frames that waited are younger than the time-out, the one before them is not."""
+    """The frames that waited are younger than the time-out. The frame before them is older."""
     start = bench.world.now
     wire = bench.wire
     for at in range(10, 300, 10):
@@ -735,7 +809,7 @@ def test_an_error_of_the_esc_in_a_hold_up_precedes_the_loss(bench: Bench) -> Non
     assert sent[:2] == [UNDERVOLTAGE, LOST]
 
 
-def test_a_heartbeat_that_was_seen_to_be_late_precedes_the_loss(bench: Bench) -> None:
+def test_a_heartbeat_that_arrived_late_precedes_the_loss(bench: Bench) -> None:
     bench.write(WATCH[1], "23 16 10 01 64 00 05 00")  # node 5: 100 ms
     bench.world.bus.came(0x705, b"\x05")
     bench.speed_until(20 * MS)
@@ -754,7 +828,7 @@ def test_the_loss_is_reported_before_the_node_stops_because_of_it(bench: Bench) 
 def test_a_loss_that_a_hold_up_hides_is_logged_between_the_two_good_states(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The loss and the return are found in one turn: the end of the turn is as its beginning."""
+    """Loss and return are found in one turn, so the link has the same state before and after it."""
     world = World()
     start = world.now
     world.wires[0].stream(start, start + 3 * SECOND, 10 * MS)
@@ -775,7 +849,7 @@ def test_a_loss_that_a_hold_up_hides_is_logged_between_the_two_good_states(
     ]
 
 
-def test_the_end_of_a_loop_is_one_line_with_reason_and_totals(
+def test_the_end_of_a_loop_is_logged_with_reason_and_totals(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World()
@@ -789,14 +863,14 @@ def test_the_end_of_a_loop_is_one_line_with_reason_and_totals(
     loop.end()
     sent = len(world.bus.sent)
     assert sent > 100
-    said = (
-        "stopped by SIGTERM after 2.0 s: 100 live frames received, 0 CRC errors, telemetry lost 1 times; "
-        f"{sent} CAN frames sent, 0 dropped, bus-off 0 times"
+    expected = (
+        "stopped by SIGTERM after 2.0 s: 100 live frames received, 0 CRC errors, "
+        f"telemetry lost 1 times; {sent} CAN frames sent, 0 dropped, bus-off 0 times"
     )
-    assert loop.conditions.recent[-1].endswith(said)
+    assert loop.conditions.recent[-1].endswith(expected)
 
 
-def test_a_fault_of_the_program_is_named_in_the_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_of_the_program_is_logged_in_the_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World()
     loop = loop_in(world, monkeypatch)
     loop.open()
@@ -807,7 +881,5 @@ def test_a_fault_of_the_program_is_named_in_the_last_line(monkeypatch: pytest.Mo
     monkeypatch.setattr(loop, "turn", fail)
     with pytest.raises(ZeroDivisionError):
         loop.run()
-    assert (
-        "ended by a fault of the program (ZeroDivisionError('x')) after"
-        in loop.conditions.recent[-1]
-    )
+    expected = "ended by a fault of the program (ZeroDivisionError('x')) after"
+    assert expected in loop.conditions.recent[-1]

@@ -1,4 +1,7 @@
-"""The whole program as a service manager meets it: ready, alive, ended; where it cannot start; and with closed standard streams."""
+"""The whole program as a service manager runs it: ready, alive and ended.
+
+It also cannot start, or starts with closed standard streams.
+"""
 
 import json
 import os
@@ -22,7 +25,7 @@ ENOUGH = 36_000
 """Bytes of a capture with some seconds of telemetry."""
 
 LIMIT_S = 120
-"""For what comes; nothing is judged by how long it takes."""
+"""Time limit in s for an expected event. No test depends on its duration."""
 
 
 CONFIGURATION = """
@@ -39,10 +42,10 @@ def size_of(folder: Path) -> int:
 
 
 @pytest.mark.rights
-def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
+def test_a_service_notifies_ready_and_alive_records_and_notifies_its_end(
     tmp_path: Path,
 ) -> None:
-    """By a configuration of 0.5.0, which asks for a CAN log beside the capture: that is not written any more."""
+    """The configuration is of 0.5.0. Its CAN log beside the capture is no longer written."""
     config, file, errors = (tmp_path / name for name in ("g.toml", "status.json", "errors"))
     manager = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
     environment = os.environ | manager | {"RUNTIME_DIRECTORY": str(tmp_path)}
@@ -61,7 +64,8 @@ def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
         listening.settimeout(LIMIT_S)
         process = subprocess.Popen(command, stderr=log, env=environment)
         try:
-            said, end = "", time.monotonic() + LIMIT_S
+            said = ""
+            end = time.monotonic() + LIMIT_S
 
             def heard(condition: Callable[[], bool]) -> None:
                 nonlocal said
@@ -82,7 +86,7 @@ def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
             recorded = size_of(captures)
             heard(lambda: size_of(captures) > recorded + ENOUGH)
             assert json.loads(file.read_text())["escs"][0]["name"] == "esc1"
-            process.send_signal(signal.SIGHUP)  # as where a terminal is closed
+            process.send_signal(signal.SIGHUP)  # as if the terminal is closed
             heard(lambda: "STOPPING=1" in said)
             assert process.wait(LIMIT_S) == 0
         finally:
@@ -93,16 +97,18 @@ def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
     assert "record.can_log: was removed and is ignored. `kontronik-can-gw convert" in logged
     last = logged.splitlines()[-1]
     totals = (
-        r"stopped by SIGHUP after [\d.]+ s: (\d+) live frames received, 0 CRC errors, telemetry lost 0 times; "
-        r"(\d+) CAN frames sent, 0 dropped, bus-off 0 times"
+        r"stopped by SIGHUP after [\d.]+ s: (\d+) live frames received, 0 CRC errors, "
+        r"telemetry lost 0 times; (\d+) CAN frames sent, 0 dropped, bus-off 0 times"
     )
     found_totals = re.search(totals, last)
     assert found_totals is not None, last
     assert min(map(int, found_totals.groups())) > 20
     if "not permitted" in logged:
-        assert "Running without." in logged and policy == os.SCHED_OTHER
+        assert "Running without." in logged
+        assert policy == os.SCHED_OTHER
     else:
-        assert (policy, priority) == (os.SCHED_FIFO, 7)
+        assert policy == os.SCHED_FIFO
+        assert priority == 7
     assert {path.suffix for path in captures.iterdir()} == {".kcap"}
     converted = tmp_path / "converted.log"
     subprocess.run([*PROGRAM, "convert", "-q", str(captures), str(converted)], check=True)
@@ -114,7 +120,7 @@ def test_it_is_ready_and_alive_records_all_and_says_that_it_ends(
         assert re.fullmatch(r".*\.dbc, layout [0-9A-F]{8}", found.provenance["DBC"])
 
 
-def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path: Path) -> None:
+def test_a_service_that_cannot_start_reports_why_and_waits_before_it_ends(tmp_path: Path) -> None:
     config = tmp_path / "gateway.toml"
     config.write_text("nonsense")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
@@ -134,8 +140,11 @@ def test_a_service_that_cannot_start_says_why_and_waits_before_it_ends(tmp_path:
     assert b"Traceback" not in errors
 
 
-def test_closed_standard_streams_never_lend_their_number_to_a_port(tmp_path: Path) -> None:
-    """With descriptor 2 closed a port could get that number, and what is written to standard error would go to the ESC."""
+def test_a_port_never_gets_the_number_of_a_closed_standard_stream(tmp_path: Path) -> None:
+    """If descriptor 2 is closed, a port could get its number.
+
+    Messages to standard error would then be sent to the ESC.
+    """
     code = (
         "import os; [os.close(n) for n in (0, 1, 2)]\n"
         "from kontronik_can_gw.cli import main\n"
@@ -157,8 +166,11 @@ folders.RUN, folders.TEMPORARY = Path({folder!r}, "run"), Path({folder!r}, "tmp"
 BY_HAND = '[can]\ninterface = "virtual"\n{more}[[esc]]\nport = "{port}"\n'
 
 
-def test_gateways_run_by_hand_are_found_by_status_until_they_end(tmp_path: Path) -> None:
-    """With and without ``statistics.file``; one is killed, and its file goes when the next gateway starts."""
+def test_status_finds_gateways_run_by_hand_until_they_end(tmp_path: Path) -> None:
+    """They run with and without ``statistics.file``.
+
+    One gateway is killed, and its file is removed when the next gateway starts.
+    """
     for name in ("run", "tmp"):
         (tmp_path / name).mkdir()
     (tmp_path / "sitecustomize.py").write_text(ELSEWHERE.format(folder=str(tmp_path)))
@@ -172,18 +184,20 @@ def test_gateways_run_by_hand_are_found_by_status_until_they_end(tmp_path: Path)
         running[name] = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
 
     def status(*words: object) -> tuple[int, set[str]]:
-        """Exit code, and the configurations of the gateways that are shown."""
+        """Return the exit code, and the configurations of the gateways that are shown."""
         command = [*PROGRAM, "status", "--json", *map(str, words)]
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True)
-        found = json.loads(done.stdout)["gateways"]
-        return done.returncode, {
-            Path(each["document"]["configuration"]).stem for each in found if each["document"]
-        }
+        gateways = json.loads(done.stdout)["gateways"]
+        documents = [each["document"] for each in gateways if each["document"]]
+        names = {Path(document["configuration"]).stem for document in documents}
+        return done.returncode, names
 
     def until(expected: tuple[int, set[str]]) -> None:
         end = time.monotonic() + LIMIT_S
-        while (found := status()) != expected:
+        found = status()
+        while found != expected:
             assert time.monotonic() < end, (found, expected)
+            found = status()
 
     with feeding(tmp_path, 2) as escs:
         for esc in escs:
@@ -214,8 +228,10 @@ def test_gateways_run_by_hand_are_found_by_status_until_they_end(tmp_path: Path)
     assert not list(tmp_path.glob("*/**/status/*"))
 
 
-def test_a_second_gateway_with_one_configuration_runs_without_a_status_and_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_second_gateway_with_the_same_configuration_has_no_status(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     first = open_statistics(None, tmp_path / "gateway.toml")

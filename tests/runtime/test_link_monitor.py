@@ -1,4 +1,4 @@
-"""rtnetlink messages: built here byte by byte, and the real kernel's about the loopback interface."""
+"""rtnetlink messages: some are built here byte by byte, others come from the real kernel."""
 
 import os
 import select
@@ -19,15 +19,24 @@ def attribute(kind: int, value: bytes) -> bytes:
 
 
 def link_message(
-    kind: int = 16, name: str = "can0", flags: int = 0x10041, can: bytes | None = b""
+    kind: int = 16,
+    name: str = "can0",
+    flags: int = 0x10041,
+    can: bytes | None = b"",
 ) -> bytes:
-    info = b"" if can is None else attribute(18, attribute(1, b"can\0") + attribute(2, can))
-    body = struct.pack("=BxHiII", 0, 280, 3, flags, 0) + attribute(3, name.encode() + b"\0") + info
+    info = b""
+    if can is not None:
+        info = attribute(18, attribute(1, b"can\0") + attribute(2, can))
+    head = struct.pack("=BxHiII", 0, 280, 3, flags, 0)
+    body = head + attribute(3, name.encode() + b"\0") + info
     return struct.pack("=IHHII", 16 + len(body), kind, 0, 0, 0) + body
 
 
 def can_data(state: int = 0) -> bytes:
-    """Of a controller with 125 kbit/s that is not restarted by itself, its error counters 130 and 7."""
+    """Return the attributes of a controller at 125 kbit/s without automatic restart.
+
+    Its error counters are 130 and 7.
+    """
     parts = {
         1: struct.pack("=8I", 125_000, 875, *range(6)),
         4: struct.pack("=I", state),
@@ -61,7 +70,8 @@ class FakeSocket:
 
 
 def monitor_of(*datagrams: bytes | int) -> tuple[LinkMonitor, FakeSocket]:
-    monitor, fake = LinkMonitor("can0"), FakeSocket(*datagrams)
+    monitor = LinkMonitor("can0")
+    fake = FakeSocket(*datagrams)
     monitor.close()
     monitor._socket = fake  # type: ignore[assignment]
     return monitor, fake
@@ -83,34 +93,51 @@ def heard(*datagrams: bytes | int) -> list[LinkFacts]:
         (77, 0x10041, None, True),
     ],
 )
-def test_what_a_controller_reports(
-    number: int, flags: int, state: CanState | None, runs: bool
+def test_the_state_of_a_controller_is_read_from_its_report(
+    number: int,
+    flags: int,
+    state: CanState | None,
+    runs: bool,
 ) -> None:
-    """One in bus-off is up and does not run."""
-    expected = LinkFacts(True, True, "can", state, 125_000, 0, (130, 7), runs)
+    """An interface in bus-off is up but does not run."""
+    expected = LinkFacts(
+        True,
+        True,
+        "can",
+        state,
+        125_000,
+        0,
+        (130, 7),
+        runs,
+    )
     assert heard(link_message(can=can_data(number), flags=flags)) == [expected]
 
 
-def test_other_interfaces_are_none_of_ours_and_a_removed_one_is_gone() -> None:
+def test_other_interfaces_are_ignored_and_a_removed_one_is_gone() -> None:
     others = link_message(name="can1") + link_message(kind=17, name="eth0")
     datagram = others + link_message() + link_message(kind=17)
     assert [facts.exists for facts in heard(datagram)] == [True, False]
 
 
-def test_after_an_overrun_the_kernel_is_asked_anew() -> None:
+def test_the_kernel_is_asked_again_after_an_overrun() -> None:
     monitor, fake = monitor_of(105, link_message())
     assert len(monitor.take()) == 1
     assert len(fake.sent) == 1
 
 
 @given(st.integers(1, len(LINK)), st.integers(0, 255), st.integers(0, 200), st.binary(max_size=200))
-def test_damage_and_rubbish_raise_nothing(end: int, value: int, place: int, rubbish: bytes) -> None:
+def test_damaged_messages_raise_no_exception(
+    end: int,
+    value: int,
+    place: int,
+    rubbish: bytes,
+) -> None:
     message = bytearray(LINK)
     message[min(place, len(message) - 1)] = value
     heard(bytes(message[:end]), rubbish or b"?")
 
 
-def test_the_real_kernel_tells_of_an_interface_and_that_there_is_none() -> None:
+def test_the_real_kernel_reports_an_interface_and_a_missing_one() -> None:
     found = []
     for name in ("lo", "nocan77"):
         monitor = link_monitor.link_monitor(name)
@@ -120,5 +147,7 @@ def test_the_real_kernel_tells_of_an_interface_and_that_there_is_none() -> None:
         found.append(monitor.take()[-1])
         monitor.close()
     is_up = bool(int(Path("/sys/class/net/lo/flags").read_text(), 16) & 1)  # IFF_UP
-    assert (found[0].exists, found[0].up, found[0].state) == (True, is_up, None)
+    assert found[0].exists
+    assert found[0].up == is_up
+    assert found[0].state is None
     assert found[1] == LinkFacts(False)

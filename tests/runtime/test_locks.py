@@ -1,4 +1,4 @@
-"""Node-IDs and messages belong to one gateway on a machine; nobody but a gateway can take one."""
+"""Only one gateway on a machine can use a node-ID or send a message. Only gateways take locks."""
 
 import errno
 import fcntl
@@ -26,7 +26,7 @@ NODES = [f"{CHANNEL}: CANopen node {number}" for number in (5, 6, 7)]
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the lock folder of this test alone. Any user may create it."""
+    """Return the lock folder of this test. Any user may create it."""
     path = tmp_path / "run" / "kontronik-can-gw" / "lock"
     monkeypatch.setattr(folders, "RUN", tmp_path / "run")
     monkeypatch.setattr(folders, "TEMPORARY", tmp_path / "tmp")
@@ -36,8 +36,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.rights
-def test_what_one_has_another_cannot_have_until_it_is_given_back(folder: Path) -> None:
-    first, second = Locks(), Locks()
+def test_a_lock_is_exclusive_until_it_is_released(folder: Path) -> None:
+    first = Locks()
+    second = Locks()
     assert first.hold(NODES[:2]) == []
     assert first.hold(NODES[:2]) == []
     mode = {0: 0o660}.get(os.geteuid(), 0o600)
@@ -51,11 +52,16 @@ def test_what_one_has_another_cannot_have_until_it_is_given_back(folder: Path) -
     assert list(folder.iterdir()) == []
 
 
-def test_a_file_that_its_holder_removes_is_not_mistaken_for_the_lock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_lock_file_that_its_holder_removes_is_created_again(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The holder removes its file between our opening and our locking: what we have locked is nothing."""
-    path, real = tmp_path / "x", fcntl.flock
+    """The holder removes its file after we open it and before we lock it.
+
+    Our lock would then be on a file that has no name.
+    """
+    path = tmp_path / "x"
+    real = fcntl.flock
 
     def flock(fd: int, operation: int) -> None:
         monkeypatch.undo()
@@ -97,8 +103,11 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -
 
 
 @pytest.mark.parametrize("kind", ["folder", "link", "no locks there"])
-def test_what_cannot_be_locked_is_reported_once_and_done_without(
-    kind: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_lock_that_cannot_be_taken_is_reported_once_and_not_needed(
+    kind: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def no_locks(_fd: int, _kind: int) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
@@ -115,19 +124,23 @@ def test_what_cannot_be_locked_is_reported_once_and_done_without(
     mine = Locks(said.append)
     assert mine.hold(NODES[:1]) == mine.hold(NODES) == []
     mine.close()
-    assert len(said) == 1 and "Nothing keeps a second gateway" in said[0]
+    assert len(said) == 1
+    assert "Nothing keeps a second gateway" in said[0]
     assert not (tmp_path / "other").exists()
 
 
-@pytest.mark.parametrize("name", [NODES[0], "/dev/serial/by-id/usb-A%2F_1@115200", "/ä" * 150])
-def test_a_file_name_stands_for_one_lock(name: str) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [NODES[0], "/dev/serial/by-id/usb-A%2F_1@115200", "/ä" * 150],
+)
+def test_every_lock_has_a_distinct_and_valid_file_name(name: str) -> None:
     assert "/" not in file_name(name)
     assert len(os.fsencode(file_name(name))) < 250
     assert file_name(name) != file_name(name + "0")
 
 
 def waiting_gateway(monkeypatch: pytest.MonkeyPatch) -> CanLink:
-    """A CANopen gateway whose node waits for LSS, on an interface that opens."""
+    """Return a CANopen gateway whose node waits for LSS. Its interface is open."""
     tables = {
         "can": {"channel": CHANNEL},
         "dbc": {"enabled": False},
@@ -145,7 +158,7 @@ def waiting_gateway(monkeypatch: pytest.MonkeyPatch) -> CanLink:
 
 
 def assign_node_id(link: CanLink, node_id: int) -> None:
-    """LSS: switch to configuration, configure the node-ID, switch back: the node boots with it."""
+    """Assign a node-ID by LSS: configuration state, node-ID, waiting state. The node boots."""
     for data in ("04 01", f"11 {node_id:02x}", "04 00"):
         request = bytes.fromhex(data).ljust(8, b"\0")
         link._gateway.receive_frame(CanFrame(0x7E5, request), 0, 0)
@@ -153,10 +166,11 @@ def assign_node_id(link: CanLink, node_id: int) -> None:
     link.follow_ids()
 
 
-def test_a_node_id_that_lss_assigns_while_running_is_locked(
+def test_a_node_id_assigned_by_lss_is_locked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    link, other = waiting_gateway(monkeypatch), Locks()
+    link = waiting_gateway(monkeypatch)
+    other = Locks()
     assert other.hold(NODES[:1]) == []
     other.close()
     assign_node_id(link, 5)
@@ -166,10 +180,12 @@ def test_a_node_id_that_lss_assigns_while_running_is_locked(
     other.close()
 
 
-def test_a_node_id_of_lss_that_another_gateway_has_is_logged(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_node_id_assigned_by_lss_that_another_gateway_has_is_logged(
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    link, other = waiting_gateway(monkeypatch), Locks()
+    link = waiting_gateway(monkeypatch)
+    other = Locks()
     assert other.hold(NODES[:1]) == []
     assign_node_id(link, 5)
     assert "can0: CANopen node 5: another gateway on this machine sends this." in caplog.text

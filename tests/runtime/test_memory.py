@@ -1,4 +1,7 @@
-"""Memory does not grow with what a gateway receives: counts of allocations, whatever the speed of the machine is."""
+"""Memory does not grow with the received frames.
+
+The test counts allocations, so it does not depend on the speed of the machine.
+"""
 
 import gc
 import sys
@@ -22,13 +25,13 @@ from kontronik_can_gw.times import MS, SECOND
 
 LIVE_EACH = 20 * MS
 EVENTS_A_SECOND = 2 * (SECOND // LIVE_EACH + 1)
-"""Live and info frames of two ESCs."""
+"""Live and info frames of two ESCs in a second."""
 ONCE = 60
-"""Blocks that are allocated once, whenever that happens: a number above 256, a list that grows."""
+"""Blocks that may be allocated once at any time, for a number above 256 or a list that grows."""
 
 
 class Everything:
-    """Two ESCs with CANopen nodes and DroneCAN, recorded, in a world without a clock."""
+    """A recorded gateway with two ESCs, CANopen nodes and DroneCAN, in a World without a clock."""
 
     def __init__(self, patch: pytest.MonkeyPatch, folder: Path) -> None:
         setup, layout = made(2, True, dronecan={"enabled": True, "node_id": 42})
@@ -42,8 +45,12 @@ class Everything:
         self.count = 0
 
     def pass_second(self) -> None:
-        """Values, and an error bit, change. What the world itself keeps is dropped."""
-        world, begin = self.world, self.world.now
+        """Let a second pass, in which values and an error bit change.
+
+        The World's own records are discarded.
+        """
+        world = self.world
+        begin = self.world.now
         for wire in world.wires:
             del wire.arrivals[: wire._read], wire._bytes[: wire._read]
             wire._read = 0
@@ -57,7 +64,7 @@ class Everything:
         world.bus.sent.clear()
         del world.looks[:-2]
         run(self.loop, world, begin + SECOND)
-        self.recorder._work([])  # what the thread does
+        self.recorder._work([])  # the work of the recorder's thread
 
     def _put(self, wire: wire_world.Wire, data: bytes, at: int) -> None:
         wire.put(data, [at + (n + 1) * wire_world.NS_PER_BYTE for n in range(len(data))])
@@ -65,7 +72,7 @@ class Everything:
 
 @pytest.fixture
 def settled() -> Iterator[None]:
-    """As the program does it at its start: no full collection by itself."""
+    """Switch off automatic full collections, as the program does at its start."""
     gc.collect()
     gc.freeze()
     before = gc.get_threshold()
@@ -77,9 +84,12 @@ def settled() -> Iterator[None]:
 
 @pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
 def test_a_thousand_events_leave_no_allocation(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, settled: None, core_language: str
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    settled: None,
+    core_language: str,
 ) -> None:
-    """From the collection of one minute to that of the next, with recording, CANopen and DroneCAN."""
+    """Blocks are counted at the full collections of two minutes in succession."""
     del settled, core_language
     it = Everything(monkeypatch, tmp_path)
     collected: list[int] = []

@@ -1,4 +1,4 @@
-"""The parameter files: order, results, damage, kill -9, full and read-only disks, and loss of power at every instant."""
+"""The parameter files: order, results, damage, failing disks, and loss of power at any time."""
 
 import errno
 import itertools
@@ -21,15 +21,20 @@ PATIENCE = 30.0
 
 
 def numbered(number: int, size: int = 16) -> bytes:
-    """A file that carries a number, and ``size`` bytes more."""
-    return encode(Stored(None, {}, {0x210001: number.to_bytes(4, "little"), 0x210002: bytes(size)}))
+    """Return the content of a file that has a number and ``size`` further bytes."""
+    application = {
+        0x210001: number.to_bytes(4, "little"),
+        0x210002: bytes(size),
+    }
+    return encode(Stored(None, {}, application))
 
 
 def number_of(stored: Stored) -> int:
     return int.from_bytes(stored.application.get(0x210001, b""), "little")
 
 
-OLD, NEW = numbered(1), numbered(2)
+OLD = numbered(1)
+NEW = numbered(2)
 
 
 @pytest.fixture
@@ -40,7 +45,7 @@ def store(tmp_path: Path) -> Iterator[ParameterStore]:
 
 
 def put(store: ParameterStore, name: str, data: bytes) -> str | None:
-    """Save one content and return its result, taken as the loop does: when the descriptor is readable."""
+    """Save one content. Return its result, read when the descriptor is readable as in the loop."""
     assert store.save(name, data)
     assert select.select([store.fileno()], [], [], PATIENCE)[0], "no result came"
     ((about, problem),) = store.results()
@@ -49,7 +54,10 @@ def put(store: ParameterStore, name: str, data: bytes) -> str | None:
     return problem
 
 
-def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterStore) -> None:
+def test_saved_parameters_are_loaded_by_the_next_store(
+    tmp_path: Path,
+    store: ParameterStore,
+) -> None:
     assert store.load("a", decode) == (None, None)
     assert list(tmp_path.iterdir()) == [], "nothing is made by reading"
     assert put(store, "a", OLD) is None
@@ -66,8 +74,9 @@ def test_what_was_saved_is_loaded_by_the_next(tmp_path: Path, store: ParameterSt
     assert again.close(0)
 
 
-def test_files_are_the_owners_alone_and_a_folder_that_is_made_too(
-    tmp_path: Path, store: ParameterStore
+def test_files_and_a_new_folder_are_accessible_only_to_their_owner(
+    tmp_path: Path,
+    store: ParameterStore,
 ) -> None:
     before = os.umask(0)
     try:
@@ -78,8 +87,9 @@ def test_files_are_the_owners_alone_and_a_folder_that_is_made_too(
     assert found == {"params": 0o700, "esc1.params": 0o600}
 
 
-def test_a_system_without_a_thread_to_give_refuses_the_saving(
-    store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+def test_saving_is_refused_if_no_thread_can_be_started(
+    store: ParameterStore,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def start(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
@@ -103,16 +113,22 @@ def place(tmp_path: Path, data: bytes) -> Path:
 OTHER_VERSION = OLD.replace(b'"version":1', b'"version":9')
 
 
-@pytest.mark.parametrize("data", [OLD[:-5], b"", b"\0" * 200, OLD + b"\n", OTHER_VERSION])
-def test_a_damaged_file_gives_the_reason_and_the_newest_is_kept(
-    tmp_path: Path, store: ParameterStore, data: bytes
+@pytest.mark.parametrize(
+    "data",
+    [OLD[:-5], b"", b"\0" * 200, OLD + b"\n", OTHER_VERSION],
+)
+def test_a_damaged_file_is_reported_and_the_newest_one_is_kept(
+    tmp_path: Path,
+    store: ParameterStore,
+    data: bytes,
 ) -> None:
     folder = place(tmp_path, b"older rubbish")
     store.load("esc1", decode)
     place(tmp_path, data)
     stored, reason = store.load("esc1", decode)
     assert stored is None
-    assert reason is not None and str(folder / "esc1.params") in reason
+    assert reason is not None
+    assert str(folder / "esc1.params") in reason
     assert [path.name for path in folder.iterdir()] == ["esc1.params.damaged"]
     assert store.load("esc1", decode) == (None, None)
     assert put(store, "esc1", NEW) is None
@@ -120,10 +136,12 @@ def test_a_damaged_file_gives_the_reason_and_the_newest_is_kept(
     assert (folder / "esc1.params.damaged").read_bytes() == data
 
 
-def test_a_file_that_cannot_be_read_now_is_left_alone_and_half_a_new_one_is_never_read(
-    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch
+def test_an_unreadable_file_is_kept_and_half_a_new_file_is_never_read(
+    tmp_path: Path,
+    store: ParameterStore,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An error of the disk that passes must not cost the settings."""
+    """A temporary error of the disk must not lose the settings."""
     folder = place(tmp_path, OLD)
     (folder / "esc1.params.tmp").write_bytes(NEW)
 
@@ -133,7 +151,9 @@ def test_a_file_that_cannot_be_read_now_is_left_alone_and_half_a_new_one_is_neve
     with monkeypatch.context() as patched:
         patched.setattr(Path, "read_bytes", fail)
         stored, reason = store.load("esc1", decode)
-    assert stored is None and reason and reason.endswith("Input/output error")
+    assert stored is None
+    assert reason
+    assert reason.endswith("Input/output error")
     assert store.load("esc1", decode) == (decode(OLD), None)
     assert [path.name for path in folder.iterdir()] == ["esc1.params"]
 
@@ -145,7 +165,10 @@ Step = tuple[str, ...]
 
 
 class Recorder:
-    """Writes down, in their order, the calls that change or secure what is on disk. The one that is ``failing`` raises ``error``."""
+    """Records the calls that change or sync the disk, in their order.
+
+    The call given as ``failing`` raises ``error``.
+    """
 
     def __init__(
         self,
@@ -155,7 +178,9 @@ class Recorder:
         error: OSError | None = None,
     ) -> None:
         self.steps: list[Step] = []
-        self._folder, self._failing, self._error = folder, failing, error
+        self._folder = folder
+        self._failing = failing
+        self._error = error
         self._names: dict[int, str] = {}
         self._real: dict[str, Callable[..., Any]] = {}
         names = "open write fsync close unlink replace rename mkdir truncate ftruncate"
@@ -173,7 +198,13 @@ class Recorder:
     def _unexpected(self, *arguments: Any) -> None:
         raise AssertionError(f"not a call that may change a parameter file: {arguments}")
 
-    def _open(self, path: Any, flags: int, *more: Any, **options: Any) -> int:
+    def _open(
+        self,
+        path: Any,
+        flags: int,
+        *more: Any,
+        **options: Any,
+    ) -> int:
         if Path(path).is_relative_to(self._folder):
             self._fail_at("create", self._name(path))
         fd: int = self._real["open"](path, flags, *more, **options)
@@ -185,9 +216,9 @@ class Recorder:
         return fd
 
     def _write(self, fd: int, data: bytes) -> int:
-        if any(step[0] == "write" for step in self.steps):  # some of it goes first
+        if any(step[0] == "write" for step in self.steps):  # the first part is always written
             self._fail_at("write", self._names[fd])
-        count: int = self._real["write"](fd, data[:50])  # a system may take only a part
+        count: int = self._real["write"](fd, data[:50])  # a system may write only a part
         self.steps.append(("write", self._names[fd], bytes(data[:count]).decode("latin-1")))
         return count
 
@@ -215,10 +246,15 @@ class Recorder:
 
 
 def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str, str]]:
-    """Every state in which the disk may be found: what no fsync has secured may be there, or not, or in part.
+    """Return every state that the disk may have after a loss of power.
 
-    ``files`` is what was on disk before. Changes of a folder not yet synced may each be lost or not, whatever their order (a renaming as a
-    whole); of a file not yet synced any beginning may be there, or zeros. A disk that keeps more order finds one of these states too.
+    ``files`` has the contents of the disk before the steps. Changes without fsync may be on disk
+    or not:
+
+    - Each change of a folder may be lost or kept, in any order. A renaming is one change.
+    - A file may have any first part of its new content, or zeros.
+
+    A disk that keeps more order has one of these states too.
     """
     contents: dict[int, str] = dict(enumerate(files.values()))
     secured: dict[int, str] = dict(contents)
@@ -235,8 +271,9 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
             contents[entries[step[1]]] += step[2]
         elif step[0] == "fsync" and step[1] in entries:
             secured[entries[step[1]]] = contents[entries[step[1]]]
-        elif step[0] == "fsync":  # a folder: entries are named with theirs
-            durable, pending = dict(entries), []
+        elif step[0] == "fsync":  # the step is about a folder, and entries include its name
+            durable = dict(entries)
+            pending = []
         elif step[0] == "unlink":
             del entries[step[1]]
             pending.append({step[1]: None})
@@ -256,7 +293,8 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
         for damage in range(4 if torn else 1):
             state = {}
             for name, inode in names.items():
-                whole, safe = contents[inode], secured[inode]
+                whole = contents[inode]
+                safe = secured[inode]
                 if inode in torn:
                     half = whole[: (len(safe) + len(whole)) // 2]
                     whole = (safe, half, "\0" * len(whole), whole)[damage]
@@ -266,9 +304,15 @@ def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str,
 
 
 def recorded(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, *contents: bytes, load: bool = False
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    *contents: bytes,
+    load: bool = False,
 ) -> list[Step]:
-    """What the store does on disk for one load, or for savings one after the other; each confirmation is a step too."""
+    """Return the steps of the store on disk for one load, or for several savings in succession.
+
+    Each confirmation is a step too.
+    """
     store = ParameterStore(folder)
     with monkeypatch.context() as patched:
         recorder = Recorder(patched, folder)
@@ -282,29 +326,34 @@ def recorded(
 
 
 FILE = "params/esc1.params"
-TEMPORARY, DAMAGED = f"{FILE}.tmp", f"{FILE}.damaged"
+TEMPORARY = f"{FILE}.tmp"
+DAMAGED = f"{FILE}.damaged"
 
 
 def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
-    """What may be found after a loss of power that is neither the content confirmed last nor a later one asked for."""
-    asked = [files.get(FILE, "")] + [step[1] for step in steps if step[0] == "confirmed"]
+    """Return the wrong contents that may be found after a loss of power.
+
+    The content confirmed last is right, and so is the one being saved.
+    """
+    asked = [files.get(FILE, "")]
+    asked += [step[1] for step in steps if step[0] == "confirmed"]
     wrong = []
     for length in range(len(steps) + 1):
         done = steps[:length]
         confirmed = sum(step[0] == "confirmed" for step in done)
         allowed = asked[confirmed : confirmed + 2]
-        wrong += [
-            state.get(FILE, "")
-            for state in after_power_loss(files, done)
-            if state.get(FILE, "") not in allowed
-        ]
+        found = [state.get(FILE, "") for state in after_power_loss(files, done)]
+        wrong += [content for content in found if content not in allowed]
     return wrong
 
 
 @pytest.mark.parametrize("left_over", [False, True])
 @pytest.mark.parametrize("first", [False, True])
-def test_at_every_instant_a_loss_of_power_finds_the_old_or_the_new_content(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_over: bool, first: bool
+def test_a_loss_of_power_at_any_instant_leaves_the_old_or_new_content(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    left_over: bool,
+    first: bool,
 ) -> None:
     folder = tmp_path / "params"
     folder.mkdir()
@@ -313,15 +362,22 @@ def test_at_every_instant_a_loss_of_power_finds_the_old_or_the_new_content(
         files[TEMPORARY] = "half of so"
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    steps = recorded(monkeypatch, folder, NEW, numbered(3), numbered(4))
+    steps = recorded(
+        monkeypatch,
+        folder,
+        NEW,
+        numbered(3),
+        numbered(4),
+    )
     of_a_new_folder = recorded(monkeypatch, tmp_path / "new", NEW)
     assert of_a_new_folder[:2] == [("mkdir", "new"), ("fsync", ".")]
     assert sum(step[0] == "confirmed" for step in steps) == 3
     assert faults(files, steps) == []
 
 
-def test_a_damaged_file_is_somewhere_at_every_instant(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_damaged_file_exists_at_every_instant(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = place(tmp_path, b"rubbish")
     (folder / "esc1.params.damaged").write_bytes(b"older")
@@ -343,15 +399,19 @@ OF_THE_FILE = [(step, TEMPORARY) for step in ("create", "write", "fsync", "close
 
 
 @pytest.mark.parametrize("failing", [*OF_THE_FILE, ("fsync", "params")])
-def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
-    tmp_path: Path, store: ParameterStore, monkeypatch: pytest.MonkeyPatch, failing: Step
+def test_a_failure_at_any_step_is_reported_and_leaves_a_complete_file(
+    tmp_path: Path,
+    store: ParameterStore,
+    monkeypatch: pytest.MonkeyPatch,
+    failing: Step,
 ) -> None:
     folder = place(tmp_path, OLD)
     with monkeypatch.context() as patched:
         Recorder(patched, folder, failing, OSError(errno.ENOSPC, "full"))
         assert put(store, "esc1", NEW) == f"{folder / 'esc1.params'}: full"
     assert [path.name for path in folder.iterdir()] == ["esc1.params"]
-    assert (folder / "esc1.params").read_bytes() == (NEW if failing == ("fsync", "params") else OLD)
+    expected = NEW if failing == ("fsync", "params") else OLD
+    assert (folder / "esc1.params").read_bytes() == expected
     assert put(store, "esc1", NEW) is None
     assert store.load("esc1", decode) == (decode(NEW), None)
 
@@ -359,8 +419,9 @@ def test_a_failure_at_any_step_is_reported_and_leaves_a_whole_file(
 # --- two gateways
 
 
-def test_a_node_belongs_to_one_gateway_until_that_closes(tmp_path: Path) -> None:
-    first, second = ParameterStore(tmp_path / "store"), ParameterStore(tmp_path / "store")
+def test_a_node_is_locked_by_one_gateway_until_it_closes(tmp_path: Path) -> None:
+    first = ParameterStore(tmp_path / "store")
+    second = ParameterStore(tmp_path / "store")
     first.lock("esc1")
     with pytest.raises(RunError, match=r"esc1\.params: is in use by another gateway"):
         second.lock("esc1")

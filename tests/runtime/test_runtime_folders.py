@@ -1,4 +1,4 @@
-"""Folders for locks and status: which one a user's gateway takes, and that nobody else's is trusted."""
+"""Folders for locks and status. A gateway never uses a folder that another user controls."""
 
 import os
 from pathlib import Path
@@ -11,7 +11,7 @@ from kontronik_can_gw.runtime.system.locks import Locks
 
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine with /run and /tmp below this folder, and no session."""
+    """Return the root of a machine with /run and /tmp, but without a session."""
     for name in ("run", "tmp"):
         (tmp_path / name).mkdir()
     monkeypatch.setattr(folders, "RUN", tmp_path / "run")
@@ -22,13 +22,15 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def ordinary_user(monkeypatch: pytest.MonkeyPatch) -> int:
-    """This process looks like an ordinary user's, who may not write to the system's folder."""
+    """Make this process look like an ordinary user's. The system's folder is not writable."""
     uid = os.geteuid()
     access = os.access
     monkeypatch.setattr(os, "geteuid", lambda: uid or 1000)
-    monkeypatch.setattr(
-        os, "access", lambda path, mode: Path(path).parent.name != "run" and access(path, mode)
-    )
+
+    def may_access(path: Path, mode: int) -> bool:
+        return Path(path).parent.name != "run" and access(path, mode)
+
+    monkeypatch.setattr(os, "access", may_access)
     if uid == 0:
         lstat = Path.lstat
 
@@ -42,7 +44,8 @@ def ordinary_user(monkeypatch: pytest.MonkeyPatch) -> int:
 
 
 def test_root_and_the_services_user_share_the_systems_folder(
-    root: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shared = root / "run" / "kontronik-can-gw"
     monkeypatch.setattr(os, "geteuid", lambda: 0)
@@ -54,8 +57,10 @@ def test_root_and_the_services_user_share_the_systems_folder(
     assert folders.runtime_folder("status") == root / "tmp" / "kontronik-can-gw-990" / "status"
 
 
-def test_a_session_folder_comes_before_the_one_in_tmp(
-    root: Path, ordinary_user: int, monkeypatch: pytest.MonkeyPatch
+def test_the_folder_of_a_session_is_preferred_to_the_one_in_tmp(
+    root: Path,
+    ordinary_user: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fallback = root / "tmp" / f"kontronik-can-gw-{ordinary_user}"
     assert folders.runtime_folder("status") == fallback / "status"
@@ -69,11 +74,13 @@ def test_a_session_folder_comes_before_the_one_in_tmp(
     assert folders.runtime_folder("status") == given / "kontronik-can-gw" / "status"
 
 
-def test_without_a_session_the_folder_in_tmp_is_closed_and_locks_hold(
-    root: Path, ordinary_user: int
+def test_without_a_session_the_folder_in_tmp_is_private_and_locks_hold(
+    root: Path,
+    ordinary_user: int,
 ) -> None:
     said: list[str] = []
-    first, second = Locks(said.append), Locks(said.append)
+    first = Locks(said.append)
+    second = Locks(said.append)
     assert first.hold(["can0: CANopen node 5"]) == []
     assert second.hold(["can0: CANopen node 5"]) == ["can0: CANopen node 5"]
     assert said == []
@@ -85,7 +92,9 @@ def test_without_a_session_the_folder_in_tmp_is_closed_and_locks_hold(
 
 @pytest.mark.parametrize("kind", ["writable by all", "link", "file"])
 def test_a_folder_in_tmp_that_another_user_controls_is_refused(
-    root: Path, ordinary_user: int, kind: str
+    root: Path,
+    ordinary_user: int,
+    kind: str,
 ) -> None:
     folder = root / "tmp" / f"kontronik-can-gw-{ordinary_user}"
     if kind == "writable by all":
@@ -102,4 +111,5 @@ def test_a_folder_in_tmp_that_another_user_controls_is_refused(
     assert not (root / "elsewhere" / "status").exists()
     said: list[str] = []
     assert Locks(said.append).hold(["x"]) == []
-    assert len(said) == 1 and "belongs to another user" in said[0]
+    assert len(said) == 1
+    assert "belongs to another user" in said[0]

@@ -1,4 +1,4 @@
-"""The document: every value true and fresh or null, every counter there, and figures that come from /proc."""
+"""The status document: every value is true and fresh or null, and every counter is in it."""
 
 import json
 import os
@@ -22,7 +22,7 @@ from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
 
-def test_a_document_is_that_of_its_moment_whatever_comes_until_it_is_made() -> None:
+def test_later_events_do_not_change_the_document_of_a_moment() -> None:
     bench = Bench()
     bench.run(3)
     moment = moment_of(bench.gateway, bench.now)
@@ -37,7 +37,7 @@ def test_a_document_is_that_of_its_moment_whatever_comes_until_it_is_made() -> N
     assert document["escs"][1]["fresh"]
 
 
-def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:
+def test_every_field_of_the_newest_frames_is_shown_in_its_unit() -> None:
     bench = Bench()
     bench.run(6)
     document = bench.document()
@@ -49,16 +49,17 @@ def test_every_field_of_the_newest_frames_is_there_in_its_unit() -> None:
                     continue
                 assert esc["values"][name] == raw / row.per_unit, name
                 assert document["units"][name] == row.unit
-        live, info = bench.newest(number, LiveData), bench.newest(number, InfoData)
+        live = bench.newest(number, LiveData)
+        info = bench.newest(number, InfoData)
         assert esc["operating_state"] == OperatingState(live.operating_state).name
-        assert (esc["device"], esc["firmware"]) == ("KOSMIK", KONTRONIK.firmware_text(info))
-        assert esc["values"]["motor_speed"] == pytest.approx(live.electrical_speed / 7, abs=1e-6)
-        assert esc["values"]["output_speed"] == pytest.approx(
-            live.electrical_speed / 7 / 9.8, abs=1e-6
-        )
-        assert esc["values"]["battery_power"] == pytest.approx(
-            live.battery_voltage * live.battery_current / 1000
-        )
+        assert esc["device"] == "KOSMIK"
+        assert esc["firmware"] == KONTRONIK.firmware_text(info)
+        motor_speed = live.electrical_speed / 7
+        output_speed = motor_speed / 9.8
+        power = live.battery_voltage * live.battery_current / 1000
+        assert esc["values"]["motor_speed"] == pytest.approx(motor_speed, abs=1e-6)
+        assert esc["values"]["output_speed"] == pytest.approx(output_speed, abs=1e-6)
+        assert esc["values"]["battery_power"] == pytest.approx(power)
         assert set(esc["values"]) == set(document["units"])
         assert (esc["link"], esc["fresh"], esc["layout"]) == ("ok", True, "V4")
 
@@ -70,7 +71,8 @@ def test_values_older_than_the_time_out_are_null() -> None:
     assert heard is not None
     last = bench.document(at=heard + 250 * MS)["escs"][0]
     late = bench.document(at=heard + 250 * MS + 1)["escs"][0]
-    assert last["fresh"] and last["values"]["battery_voltage"] is not None
+    assert last["fresh"]
+    assert last["values"]["battery_voltage"] is not None
     assert not late["fresh"]
     assert late["values"]["battery_voltage"] is late["values"]["motor_speed"] is None
     assert late["operating_state"] is late["errors"] is late["warnings"] is late["statuses"] is None
@@ -78,7 +80,7 @@ def test_values_older_than_the_time_out_are_null() -> None:
     assert bench.document(at=heard + 20 * SECOND)["escs"][0]["device"] is None
 
 
-def test_all_counters_of_the_stream_and_of_the_gateway_are_there_by_name() -> None:
+def test_all_counters_of_the_stream_and_of_the_gateway_are_shown() -> None:
     bench = Bench(1, options=EscOptions(faults=Faults(flipped_bits=1e-4)))
     bench.run(3)
     document = bench.document()
@@ -89,12 +91,13 @@ def test_all_counters_of_the_stream_and_of_the_gateway_are_there_by_name() -> No
         **bench.gateway.escs[0].counters.as_dict(),
         "suspect_frames": 0,
         "late_frames": 0,
-    } | {"line_errors": 0}
+        "line_errors": 0,
+    }
     others = {"state", "can_state", "esc_count", "escs_ok", "started_ns"}
     assert set(document["can"]["counters"]) == {f.name for f in fields(GatewayStatus)} - others
 
 
-def test_errors_warnings_and_statuses_are_told_apart_and_an_unknown_bit_is_an_error() -> None:
+def test_errors_warnings_and_statuses_are_separate() -> None:
     bench = Bench(1)
     word = (
         1 << OperatingError.UNDERVOLTAGE
@@ -110,7 +113,7 @@ def test_errors_warnings_and_statuses_are_told_apart_and_an_unknown_bit_is_an_er
     assert shown["statuses"] == ["programming_allowed"]
 
 
-def test_the_figures_of_the_process_are_those_of_proc(tmp_path: Path) -> None:
+def test_the_figures_of_the_process_match_proc(tmp_path: Path) -> None:
     before = process_facts()
     opened = [(tmp_path / f"{n}").open("w") for n in range(5)]
     after = process_facts()
@@ -119,20 +122,19 @@ def test_the_figures_of_the_process_are_those_of_proc(tmp_path: Path) -> None:
     assert after.open_fds == before.open_fds + 5
     assert after.threads == len(list(Path("/proc/self/task").iterdir()))
     status = Path("/proc/self/status").read_text(encoding="ascii")
-    resident = next(
-        int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmRSS")
-    )
+    (line,) = (line for line in status.splitlines() if line.startswith("VmRSS"))
+    resident = int(line.split()[1]) * 1024
     assert abs(after.rss_bytes - resident) < 0.2 * resident
 
 
-def test_a_process_is_known_by_its_start_and_one_that_has_ended_is_none() -> None:
+def test_a_process_is_identified_by_its_start_until_it_has_ended() -> None:
     facts = program_facts("gateway.toml")
     assert facts.pid == os.getpid()
     assert facts.ticks == start_ticks(os.getpid()) > 0
     assert Path(facts.configuration).is_absolute()
     child = os.posix_spawn("/bin/true", ["true"], {})
     os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
-    assert start_ticks(child) == -1  # ended, and nobody has asked for its exit code
+    assert start_ticks(child) == -1  # it has ended, but its exit code was not read yet
     os.waitpid(child, 0)
     assert start_ticks(child) == 0
 

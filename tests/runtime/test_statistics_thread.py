@@ -1,4 +1,8 @@
-"""The thread that writes the file: never in the loop's way, always a whole document, faults told once, gone when closed."""
+"""The thread that writes the status file.
+
+It never delays the loop, always writes a complete document, and reports a fault once. The file
+is removed when it is closed.
+"""
 
 import errno
 import json
@@ -27,9 +31,10 @@ PATIENCE = 60.0
 
 
 def numbered(number: int) -> Moment:
-    """A moment of a gateway that has sent so many frames."""
+    """Return the Moment of a gateway that has sent this number of frames."""
     gateway = Gateway([EscSettings("esc1")], Layout("", "", ()), 0)
-    gateway.status.sent_frames, gateway.status.received_frames = number, 3 * number
+    gateway.status.sent_frames = number
+    gateway.status.received_frames = 3 * number
     return moment_of(gateway, number * SECOND)
 
 
@@ -41,12 +46,15 @@ def until(condition: Callable[[], object]) -> None:
 
 
 def number_in(file: Path) -> int:
-    """The number of the document in a file, 0 without one."""
-    return int(json.loads(file.read_bytes())["monotonic_ns"]) // SECOND if file.exists() else 0
+    """Return the number of the document in a file, or 0 without a file."""
+    if not file.exists():
+        return 0
+    document = json.loads(file.read_bytes())
+    return int(document["monotonic_ns"]) // SECOND
 
 
 def put(statistics: Statistics, number: int) -> list[Report]:
-    """Publish a document, and wait until the thread has done what it can; what it reports then."""
+    """Publish a document and wait until the thread has tried to write it. Return its reports."""
     statistics.publish(numbered(number))
     until(lambda: statistics._written is statistics._newest and not statistics._worker.busy_since)
     return statistics.reports(0)
@@ -65,32 +73,40 @@ def statistics(file: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Statisti
     made.close()
 
 
-def test_the_file_is_whole_readable_for_all_one_gateways_and_gone_at_the_end(
-    file: Path, statistics: Statistics
+def test_the_file_is_complete_readable_by_all_and_removed_at_the_end(
+    file: Path,
+    statistics: Statistics,
 ) -> None:
-    (file.parent / ".status.json.tmp").write_text('{"half')  # of a process that was killed
+    (file.parent / ".status.json.tmp").write_text('{"half')  # left by a process that was killed
     for number in (1, 3):
         assert put(statistics, number) == []
         assert number_in(file) == number
     assert stat.S_IMODE(file.stat().st_mode) == 0o644
     assert os.listdir(file.parent) == ["status.json"]
     rates = json.loads(file.read_text(encoding="utf-8"))["rates"]
-    assert (rates["sent_frames_per_s"], rates["received_frames_per_s"]) == (1.0, 3.0)
+    assert rates["sent_frames_per_s"] == 1.0
+    assert rates["received_frames_per_s"] == 3.0
     with pytest.raises(RunError, match="another gateway writes it"):
         Statistics(file)
     for _ in range(2):
         statistics.close()
-        statistics.publish(numbered(4))  # too late, and nothing happens
+        statistics.publish(numbered(4))  # too late, so it has no effect
     assert os.listdir(file.parent) == []
-    before, threads = os.listdir("/proc/self/fd"), threading.active_count()
+    before = os.listdir("/proc/self/fd")
+    threads = threading.active_count()
     Statistics(file).close()
-    assert (os.listdir("/proc/self/fd"), threading.active_count()) == (before, threads)
+    assert os.listdir("/proc/self/fd") == before
+    assert threading.active_count() == threads
 
 
-def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
-    file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
+def test_a_disk_that_does_not_answer_is_reported_once_until_it_does(
+    file: Path,
+    statistics: Statistics,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    free, stuck, real = threading.Event(), threading.Event(), os.write
+    free = threading.Event()
+    stuck = threading.Event()
+    real = os.write
 
     def write(fd: int, data: bytes) -> int:
         stuck.set()
@@ -103,13 +119,15 @@ def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
     since = statistics._worker.busy_since
     assert since is not None
     for number in range(2, 502):
-        statistics.publish(numbered(number))  # which never waits
+        statistics.publish(numbered(number))  # never waits
     assert statistics.reports(since + STALE_NS) == []
     (report,) = statistics.reports(since + STALE_NS + 1)
-    assert report.begins and str(file) in report.text and "disk does not answer" in report.text
+    assert report.begins
+    assert str(file) in report.text
+    assert "disk does not answer" in report.text
     assert statistics.reports(since + 2 * STALE_NS) == []
     free.set()
-    until(lambda: number_in(file) == 501)  # the newest, and none of those between
+    until(lambda: number_in(file) == 501)  # only the newest is written
     until(lambda: [each.begins for each in statistics.reports(0)] == [False])
 
 
@@ -117,10 +135,15 @@ def test_a_disk_that_does_not_answer_is_told_once_and_when_it_answers_again(
     ("trouble", "said"),
     [("no folder", "No such file"), ("no file", "no plain file"), ("full", "No space left")],
 )
-def test_a_file_that_cannot_be_written_is_told_once_and_comes_as_soon_as_it_can(
-    trouble: str, said: str, file: Path, statistics: Statistics, monkeypatch: pytest.MonkeyPatch
+def test_a_file_that_cannot_be_written_is_reported_once_until_it_can(
+    trouble: str,
+    said: str,
+    file: Path,
+    statistics: Statistics,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    moved, real = file.parent.with_name("moved"), os.write
+    moved = file.parent.with_name("moved")
+    real = os.write
 
     def full(fd: int, data: bytes) -> int:
         if len(data) > 10:
@@ -137,10 +160,12 @@ def test_a_file_that_cannot_be_written_is_told_once_and_comes_as_soon_as_it_can(
         else:
             patch.setattr(os, "write", full)
         (report,) = put(statistics, 2)
-        assert report.begins and said in report.text
+        assert report.begins
+        assert said in report.text
         assert put(statistics, 3) == []
         if trouble == "full":
-            assert (number_in(file), os.listdir(file.parent)) == (1, ["status.json"])
+            assert number_in(file) == 1
+            assert os.listdir(file.parent) == ["status.json"]
     if trouble == "no folder":
         moved.rename(file.parent)
     if trouble == "no file":

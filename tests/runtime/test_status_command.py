@@ -1,4 +1,4 @@
-"""``status``: which file it reads, what it says of the gateway, its exit codes, and that no content of a file harms it."""
+"""The command ``status``: its files, its judgement and its exit codes. No file can harm it."""
 
 import contextlib
 import json
@@ -37,9 +37,11 @@ Document = dict[str, Any]
 
 
 def heard(
-    escs: int = 2, seconds: float = 2, change: Callable[[Bench], None] | None = None
+    escs: int = 2,
+    seconds: float = 2,
+    change: Callable[[Bench], None] | None = None,
 ) -> Bench:
-    """A healthy gateway that runs."""
+    """Return a healthy gateway that runs."""
     bench = Bench(escs)
     bench.run(seconds)
     bench.gateway.set_can_state(CanState.ERROR_ACTIVE, bench.now)
@@ -57,7 +59,7 @@ def words(seen: Seen) -> str:
 
 
 def shell(*arguments: object) -> tuple[object, str, str]:
-    """Exit code, standard output and standard error of the command."""
+    """Run the command. Return its exit code, standard output and standard error."""
     done = run("status", *arguments)
     return done.code, done.out, done.err
 
@@ -67,14 +69,17 @@ NOW = 10**15
 
 @pytest.fixture(autouse=True)
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command's time stands still."""
+    """Stop the command's clock."""
     monkeypatch.setattr("kontronik_can_gw.cli.status.time.monotonic_ns", lambda: NOW)
 
 
 def written(
-    file: Path, bench: Bench, program: ProgramFacts | None = None, **changes: Any
+    file: Path,
+    bench: Bench,
+    program: ProgramFacts | None = None,
+    **changes: Any,
 ) -> Document:
-    """A file of this process and this instant."""
+    """Write a status file of this process and this instant."""
     document = bench.document(program=program or program_facts("gateway.toml"))
     document |= {"monotonic_ns": NOW} | changes
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -98,14 +103,16 @@ def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
     bench = heard()
     bench.silent.add(1)
     bench.run(2)
-    why = "no bytes: ESC off"  # which is shown only of the one that is not heard
+    why = "no bytes: ESC off"  # shown only for the ESC that is not heard
     ports = [PortFacts(name, "/dev/a", True, diagnosis=why) for name in ("esc1", "esc2")]
     seen = judged(bench.document(ports=ports))
-    assert (seen.code, seen.sentence) == (TROUBLE, "running, 1 fault")
+    assert seen.code == TROUBLE
+    assert seen.sentence == "running, 1 fault"
     assert seen.troubles[0].startswith("esc2: no bytes: ESC off")
 
 
-ACTIVE, UNKNOWN = CanState.ERROR_ACTIVE, CanState.UNKNOWN
+ACTIVE = CanState.ERROR_ACTIVE
+UNKNOWN = CanState.UNKNOWN
 OPEN = CanFacts("socketcan", "can0", None, True)
 SLCAN = CanFacts("slcan", "x", None, True)
 CLOSED = CanFacts("socketcan", "can0", None, False, "can0: gone")
@@ -126,27 +133,31 @@ LOST = PortFacts("esc1", "/dev/a", False, "esc1: /dev/a: lost (hung up).", lost_
         (ACTIVE, {"ports": [LOST]}, ["esc1: port not open for 70.0 s: /dev/a: lost (hung up)."]),
     ],
 )
-def test_each_fault_is_a_sentence(state: CanState, facts: dict[str, Any], said: list[str]) -> None:
+def test_each_fault_is_reported_as_a_sentence(
+    state: CanState,
+    facts: dict[str, Any],
+    said: list[str],
+) -> None:
     bench = heard(1)
     bench.gateway.set_can_state(state, bench.now)
     if "ports" in facts:
         bench.gateway.port(0, False, bench.now)
         facts = {"ports": [LOST._replace(lost_since_ns=bench.now - 70 * SECOND)]}
     seen = judged(bench.document(**facts))
-    assert (seen.code, list(seen.troubles)) == (TROUBLE if said else HEALTHY, said)
+    assert seen.code == (TROUBLE if said else HEALTHY)
+    assert list(seen.troubles) == said
 
 
-def test_a_document_older_than_three_seconds_says_so_and_shows_no_value() -> None:
+def test_a_document_older_than_three_seconds_shows_no_value() -> None:
     document = heard().document()
     assert judged(document, STALE_NS).code == HEALTHY
     seen = judged(document, 12 * SECOND)
-    assert (seen.code, seen.sentence) == (
-        NOT_RUNNING,
-        "has written nothing for 12.0 s (ended, held up, or the disk is full)",
-    )
+    assert seen.code == NOT_RUNNING
+    assert seen.sentence == "has written nothing for 12.0 s (ended, held up, or the disk is full)"
     shown = words(seen)
     assert "has written nothing for 12.0 s" in shown
-    assert "25." not in shown and "esc1" not in shown
+    assert "25." not in shown
+    assert "esc1" not in shown
     assert judged(document, -STALE_NS - 1).sentence == "not running", "the machine was restarted"
 
 
@@ -156,7 +167,7 @@ def test_a_document_older_than_three_seconds_says_so_and_shows_no_value() -> Non
 CONTENTS = (b"", b"{", b"7", b"{}", b"\xff\xfe", b'{"format": 2}', b"[" * 100_000, b"1" * 5000)
 
 
-def test_what_is_no_statistics_file_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_no_statistics_file_is_refused_in_one_line(tmp_path: Path) -> None:
     file = tmp_path / "status.json"
     for content in CONTENTS:
         file.write_bytes(content)
@@ -166,22 +177,26 @@ def test_what_is_no_statistics_file_is_told_in_one_line(tmp_path: Path) -> None:
         assert said in refused(NOT_RUNNING, "status", "--file", tmp_path / name)
 
 
-def test_a_configuration_names_its_file_or_the_service_of_its_name(
-    tmp_path: Path, run_folder: Path
+def test_a_configuration_selects_its_file_or_the_service_of_its_name(
+    tmp_path: Path,
+    run_folder: Path,
 ) -> None:
     esc = '[[esc]]\nport = "x"\n'
     for name, folder in (("gateway", ""), ("left", "-left")):
         toml = tmp_path / f"{name}.toml"
         toml.write_text(esc, encoding="utf-8")
         code, _, talk = shell("-c", toml)
-        assert (code, f"run -c {toml}" in talk) == (NOT_RUNNING, True)
+        assert code == NOT_RUNNING
+        assert f"run -c {toml}" in talk
         file = run_folder / f"kontronik-can-gw{folder}" / "status.json"
         written(file, heard(), program_facts(tmp_path / "other.toml"))
         code, _, talk = shell("-c", toml)
-        assert code == NOT_RUNNING and "other.toml, not of" in talk
+        assert code == NOT_RUNNING
+        assert "other.toml, not of" in talk
         written(file, heard(), program_facts(toml))
         code, out, _ = shell("-c", toml)
-        assert (code, out.count("kontronik-can-gw ")) == (HEALTHY, 1)
+        assert code == HEALTHY
+        assert out.count("kontronik-can-gw ") == 1
         by_hand = folders.status_folders()[0] / folders.status_name(toml)
         written(file, heard(), program_facts(tmp_path / "other.toml"))
         written(by_hand, heard(), program_facts(toml))
@@ -194,30 +209,34 @@ def test_a_configuration_names_its_file_or_the_service_of_its_name(
 
 
 def test_a_broken_configuration_in_this_folder_is_only_a_warning(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("gateway.toml").write_text("cann = 1\n")
     code, out, talk = shell()
-    assert (code, out) == (NOT_RUNNING, "")
+    assert code == NOT_RUNNING
+    assert out == ""
     assert "status: warning: gateway.toml: " in talk
     assert "status: no gateway of this user or of the system runs." in talk
     written(run_folder / "kontronik-can-gw" / "status" / "1.json", heard())
     code, out, talk = shell()
-    assert (code, out.count("kontronik-can-gw "), talk) == (HEALTHY, 1, "")
+    assert code == HEALTHY
+    assert out.count("kontronik-can-gw ") == 1
+    assert talk == ""
     assert shell("-c", "gateway.toml")[0] == 2
 
 
-def test_only_the_end_of_a_service_is_explained_by_the_journal(
-    run_folder: Path, tmp_path: Path
-) -> None:
-    """A killed gateway leaves its file behind. One that was started by hand has no journal."""
+def test_only_for_an_ended_service_is_the_journal_advised(run_folder: Path, tmp_path: Path) -> None:
+    """A killed gateway leaves its file behind. A gateway started by hand has no journal."""
     stopped_ns = NOW - 60 * SECOND
     by_hand = run_folder / "kontronik-can-gw" / "status" / "1.json"
     written(by_hand, heard(), monotonic_ns=stopped_ns)
     code, out, _ = shell()
     assert code == NOT_RUNNING
-    assert "has written nothing for 60.0 s" in out and "journalctl" not in out
+    assert "has written nothing for 60.0 s" in out
+    assert "journalctl" not in out
     by_hand.unlink()
     service = run_folder / "kontronik-can-gw-left" / "status.json"
     configured = tmp_path / "statistics.json"
@@ -228,18 +247,21 @@ def test_only_the_end_of_a_service_is_explained_by_the_journal(
         assert "Why? journalctl -e -u 'kontronik-can-gw*'" in shell(*arguments)[1]
 
 
-def test_without_options_all_gateways_are_shown_and_3_means_that_none_runs(
+def test_without_options_all_gateways_are_shown_and_3_means_none_runs(
     run_folder: Path,
 ) -> None:
     code, out, talk = shell()
-    assert (code, out) == (NOT_RUNNING, "")
-    assert "sudo systemctl start kontronik-can-gw" in talk and talk.count("\n") == 1
+    assert code == NOT_RUNNING
+    assert out == ""
+    assert "sudo systemctl start kontronik-can-gw" in talk
+    assert talk.count("\n") == 1
     service = run_folder / "kontronik-can-gw" / "status.json"
     written(service, heard(), monotonic_ns=1)
     assert shell()[0] == NOT_RUNNING
     written(service, heard())
     code, out, _ = shell()
-    assert (code, out.count("kontronik-can-gw ")) == (HEALTHY, 1)
+    assert code == HEALTHY
+    assert out.count("kontronik-can-gw ") == 1
     troubled = heard(change=lambda bench: bench.gateway.set_can_state(CanState.BUS_OFF, bench.now))
     written(run_folder / "kontronik-can-gw-a" / "status.json", troubled)
     assert shell()[0] == TROUBLE
@@ -248,8 +270,10 @@ def test_without_options_all_gateways_are_shown_and_3_means_that_none_runs(
     assert (code, out.count("kontronik-can-gw ")) == (TROUBLE, 2), "one runs, one has stopped"
 
 
-def test_without_options_gateways_of_this_user_are_found_in_every_runtime_folder(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_gateways_of_this_user_are_found_in_every_runtime_folder(
+    run_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "session"))
     uid = os.geteuid()
@@ -262,21 +286,25 @@ def test_without_options_gateways_of_this_user_are_found_in_every_runtime_folder
     for number, place in enumerate(places):
         written(place / "status" / f"{number}.json", heard(), program_facts(f"{number}.toml"))
     code, out, _ = shell()
-    assert (code, [f"/{n}.toml" in out for n in range(4)]) == (HEALTHY, [True] * 4)
+    assert code == HEALTHY
+    assert [f"/{n}.toml" in out for n in range(4)] == [True] * 4
     places[3].chmod(0o777)  # another user could have written the file
     assert shell()[1].count("kontronik-can-gw ") == 3
     (places[0] / "status" / "same.json").symlink_to(places[1] / "status" / "1.json")
     assert shell()[1].count("kontronik-can-gw ") == 3, "a link is no second gateway"
 
 
-def test_json_is_one_document_with_the_judgement_and_what_the_file_held(tmp_path: Path) -> None:
+def test_json_is_one_document_with_the_judgement_and_the_file_content(tmp_path: Path) -> None:
     file = tmp_path / "status.json"
     document = written(file, heard())
     for name, code, held in ((file, HEALTHY, document), (tmp_path / "none", NOT_RUNNING, None)):
         done = shell("--file", name, "--json")
         (gateway,) = json.loads(done[1])["gateways"]
-        assert (done[0], done[2], gateway["exit_code"]) == (code, "", code)
-        assert (gateway["file"], gateway["document"]) == (str(name), held)
+        assert done[0] == code
+        assert done[2] == ""
+        assert gateway["exit_code"] == code
+        assert gateway["file"] == str(name)
+        assert gateway["document"] == held
 
 
 # --- the screen
@@ -286,11 +314,13 @@ WHOLE = with_nodes(heard(3).document(log_lines=["14:03:01 esc1: telemetry lost"]
 
 
 def places(value: object, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The paths of everything in a document."""
+    """Return the paths of all values in a document."""
     children = dict(enumerate(value)) if isinstance(value, list) else value
-    if not isinstance(children, dict):
-        return [path]
-    return [path, *(at for key, child in children.items() for at in places(child, (*path, key)))]
+    found = [path]
+    if isinstance(children, dict):
+        for key, child in children.items():
+            found += places(child, (*path, key))
+    return found
 
 
 PLACES = [place for place in places(WHOLE) if place]
@@ -306,8 +336,9 @@ _ODD = st.one_of(
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(PLACES), _ODD), min_size=1, max_size=5), st.booleans())
-def test_any_document_makes_lines_that_no_terminal_obeys(
-    changes: list[tuple[tuple[Any, ...], Any]], alive: bool
+def test_lines_of_any_document_contain_no_terminal_controls(
+    changes: list[tuple[tuple[Any, ...], Any]],
+    alive: bool,
 ) -> None:
     document: Any = json.loads(json.dumps(WHOLE))
     for place, value in changes:

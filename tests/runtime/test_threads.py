@@ -1,4 +1,7 @@
-"""Threads beside the loop: what one is handed is done in order, nothing that fails or stands still harms its owner; their priority."""
+"""Threads beside the loop, and their priority.
+
+A thread does its jobs in order. A job that fails or blocks does not harm its owner.
+"""
 
 import io
 import logging
@@ -22,7 +25,7 @@ def readable(fd: int) -> bool:
     return bool(select.select([fd], [], [], 0)[0])
 
 
-def test_a_handover_has_a_limit_and_is_readable_while_it_holds_something() -> None:
+def test_a_handover_has_a_limit_and_is_readable_while_it_has_items() -> None:
     handover: Handover[int] = Handover(3)
     assert not readable(handover.fileno())
     assert [handover.put(n) for n in range(4)] == [True, True, True, False]
@@ -38,7 +41,7 @@ def test_a_handover_has_a_limit_and_is_readable_while_it_holds_something() -> No
     assert handover.fileno() == -1
 
 
-def test_a_closed_handover_writes_to_no_descriptor_that_is_anothers_by_now() -> None:
+def test_a_closed_handover_never_writes_to_a_reused_descriptor() -> None:
     handover: Handover[int] = Handover()
     number = handover.fileno()
     handover.close()
@@ -73,11 +76,13 @@ def test_an_end_read_with_the_last_items_is_not_lost(
     assert done == [1]
 
 
-def test_a_job_that_fails_is_reported_and_the_next_one_is_done(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_job_that_fails_is_reported_and_the_next_job_is_done(
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(worker_module, "FAILURE_PAUSE_S", 0)
-    done, failures = [], []
+    done = []
+    failures = []
     reached = threading.Event()
 
     def work(items: list[int]) -> None:
@@ -96,13 +101,15 @@ def test_a_job_that_fails_is_reported_and_the_next_one_is_done(
         each.put(0)
     assert reached.wait(PATIENCE)
     worker.put(1)
-    assert worker.stop(PATIENCE) and silent.stop(PATIENCE)
-    assert (done, failures) == ([1], ["ZeroDivisionError('of ours')"])
-    assert caplog.messages == ["test: ZeroDivisionError('of ours')"], "where nobody else is told"
+    assert worker.stop(PATIENCE)
+    assert silent.stop(PATIENCE)
+    assert done == [1]
+    assert failures == ["ZeroDivisionError('of ours')"]
+    assert caplog.messages == ["test: ZeroDivisionError('of ours')"], "without a callback"
 
 
 def test_no_signal_is_delivered_to_a_thread_beside_the_loop() -> None:
-    """They are to wake the loop."""
+    """Signals must wake the loop."""
     masks: list[set[int]] = []
     thread = threading.Thread(
         target=lambda: masks.append({*signal.pthread_sigmask(signal.SIG_BLOCK, ())})
@@ -114,11 +121,11 @@ def test_no_signal_is_delivered_to_a_thread_beside_the_loop() -> None:
     assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
 
 
-# --- the log's
+# --- the thread of the log
 
 
 class StuckStream(io.StringIO):
-    """A disk that takes nothing until it is let go."""
+    """A stream that blocks until it is set free."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -133,7 +140,7 @@ class StuckStream(io.StringIO):
         return len(text)
 
 
-def test_a_stream_that_stands_still_holds_nobody_up_and_losses_are_told() -> None:
+def test_a_blocked_stream_delays_no_caller_and_losses_are_logged() -> None:
     stream = StuckStream()
     handler = BackgroundHandler(stream, longest_end_s=0)
     handler.handle(logging.makeLogRecord({"msg": "first"}))
@@ -141,7 +148,7 @@ def test_a_stream_that_stands_still_holds_nobody_up_and_losses_are_told() -> Non
     for n in range(CAPACITY + 500):
         handler.handle(logging.makeLogRecord({"msg": "line %d", "args": (n,)}))
     handler.close()
-    assert stream.written == [], "all that was before anything was written"
+    assert stream.written == [], "all this happened before the first line was written"
     stream.free.set()
     handler._longest_end_s = 60
     handler.close()
@@ -152,9 +159,10 @@ def test_a_stream_that_stands_still_holds_nobody_up_and_losses_are_told() -> Non
 
 
 @pytest.mark.parametrize(
-    "error", [OSError(5, "Input/output error"), ValueError("I/O operation on closed file")]
+    "error",
+    [OSError(5, "Input/output error"), ValueError("I/O operation on closed file")],
 )
-def test_a_stream_that_fails_is_no_trouble(error: Exception) -> None:
+def test_a_stream_that_fails_raises_no_exception(error: Exception) -> None:
     class Broken(io.StringIO):
         def write(self, text: str) -> int:
             raise error
@@ -169,7 +177,7 @@ def test_a_stream_that_fails_is_no_trouble(error: Exception) -> None:
 
 
 class Scheduler:
-    """Stands for the kernel's: which thread has which policy and priority."""
+    """Replacement for the kernel's scheduler: policy and priority of each thread."""
 
     def __init__(self) -> None:
         self.of: dict[int, tuple[int, int]] = {}
@@ -190,7 +198,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Scheduler:
     return scheduler
 
 
-def test_the_loop_goes_before_the_threads_beside_it(kernel: Scheduler) -> None:
+def test_the_loop_has_priority_over_the_threads_beside_it(kernel: Scheduler) -> None:
     ended = threading.Event()
     sleepers = [threading.Thread(target=ended.wait, daemon=True) for _ in range(2)]
     sleepers[0].start()
@@ -201,8 +209,9 @@ def test_the_loop_goes_before_the_threads_beside_it(kernel: Scheduler) -> None:
     ended.set()
 
 
-def test_what_is_not_permitted_is_said_with_the_remedy(
-    kernel: Scheduler, monkeypatch: pytest.MonkeyPatch
+def test_a_priority_that_is_not_permitted_is_reported_with_the_remedy(
+    kernel: Scheduler,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     kernel.permits = False
     monkeypatch.delenv("INVOCATION_ID", raising=False)

@@ -1,4 +1,7 @@
-"""The two lines that wait to be sent: the queue that keeps its order, the slots of which the newest wins, and their turns."""
+"""Frames that wait to be sent: the queue keeps its order, and in a slot the newest frame wins.
+
+If both have frames left over, queue and slots send in turn.
+"""
 
 from collections import Counter
 from itertools import pairwise
@@ -22,7 +25,7 @@ def slot(can_id: int, number: int = 0) -> CanFrame:
 
 
 def send(queue: TransmitQueue, sent: list[CanFrame], count: int) -> int:
-    """An interface that takes at most ``count`` frames. Returns how many it took."""
+    """Let an interface take at most ``count`` frames. Return the number that it took."""
     frames = queue.in_order()
     taken = frames[:count]
     sent += taken
@@ -30,22 +33,27 @@ def send(queue: TransmitQueue, sent: list[CanFrame], count: int) -> int:
     return len(taken)
 
 
-def test_the_queue_is_bounded_and_counts_what_it_loses() -> None:
-    queue, sent = TransmitQueue(), list[CanFrame]()
+def test_the_queue_is_bounded_and_counts_its_losses() -> None:
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):
         queue.put_all([queued(n)])
-    assert (len(queue), queue.dropped) == (QUEUE_LENGTH, 10)
+    assert len(queue) == QUEUE_LENGTH
+    assert queue.dropped == 10
     queue.put_all([slot(0x181)])
     assert len(queue) == QUEUE_LENGTH + 1, "slots are not held by a full queue"
     send(queue, sent, 2)
     queue.put_all([queued(7)])
     queue.clear()
-    assert (len(queue), queue.dropped, queue.replaced) == (0, 10 + QUEUE_LENGTH - 1, 1)
+    assert len(queue) == 0
+    assert queue.dropped == 10 + QUEUE_LENGTH - 1
+    assert queue.replaced == 1
     assert send(queue, sent, 9) == 0
 
 
 def test_frames_of_a_step_keep_their_order_and_leftovers_alternate() -> None:
-    queue, sent = TransmitQueue(), list[CanFrame]()
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
     step = [queued(1, 0x81), slot(0x18040A2A), queued(2, 0x82), slot(0x181), slot(0x182)]
     queue.put_all(step)
     assert queue.in_order() == step
@@ -62,10 +70,12 @@ def test_frames_of_a_step_keep_their_order_and_leftovers_alternate() -> None:
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(1, 7)), max_size=60))
-def test_what_is_sent_of_transfers_is_whole_and_the_newest(steps: list[int | None]) -> None:
-    """``steps``: put a newer transfer of two frames or three, or let the interface take so many frames."""
-    queue, sent = TransmitQueue(), list[CanFrame]()
-    pages, wanted = {0x18040A2A: (64, 65, 66), 0x18040C2A: (67, 68)}, 0
+def test_sent_transfers_are_complete_and_the_newest(steps: list[int | None]) -> None:
+    """A step puts newer transfers of two and three frames, or lets the interface take frames."""
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
+    pages = {0x18040A2A: (64, 65, 66), 0x18040C2A: (67, 68)}
+    wanted = 0
     for number, step in enumerate(steps):
         if step is None:
             for can_id, parts in pages.items():
@@ -86,15 +96,20 @@ PUTS = st.tuples(st.booleans(), st.integers(0x181, 0x184))
 STEPS = st.lists(st.one_of(PUTS, st.integers(0, 6)), max_size=80)
 
 
-@settings(deadline=None)  # a busy machine is no fault
+@settings(deadline=None)  # a busy machine must not fail the test
 @given(STEPS, st.booleans())
-def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent(
-    steps: list[tuple[bool, int] | int], one_by_one: bool
+def test_queued_frames_keep_their_order_and_each_slot_sends_its_newest(
+    steps: list[tuple[bool, int] | int],
+    one_by_one: bool,
 ) -> None:
-    """``steps``: put a (queued?, id) frame, or let the interface take so many frames, at once or with turns broken off after each."""
-    queue, sent = TransmitQueue(), list[CanFrame]()
+    """A step puts a frame, given as (is queued, id), or lets the interface take frames.
+
+    The interface takes the frames at once, or one by one in separate turns.
+    """
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
     put: list[CanFrame] = []
-    newest: dict[int, CanFrame] = {}  # slots that wait
+    newest: dict[int, CanFrame] = {}  # the waiting slots
     has_leftovers = False
     for number, step in enumerate(steps):
         if isinstance(step, tuple):
@@ -104,7 +119,8 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
                 newest[frame.can_id] = frame
             queue.put_all([frame])
             continue
-        before, both = len(sent), has_leftovers and 0 < len(newest) < len(queue)
+        before = len(sent)
+        both = has_leftovers and 0 < len(newest) < len(queue)
         for _ in range(step if one_by_one else 1):
             send(queue, sent, 1 if one_by_one else step)
         now_sent = sent[before:]
@@ -115,25 +131,27 @@ def test_nothing_queued_is_lost_or_overtaken_and_of_each_slot_the_newest_is_sent
         if both:
             lines = [frame.queued for frame in now_sent]
             shorter = min(Counter(lines).values()) if len(set(lines)) == 2 else 0
-            assert all(a != b for a, b in pairwise(lines[: 2 * shorter])), (
-                "no turns while both waited"
-            )
+            turns = pairwise(lines[: 2 * shorter])
+            assert all(a != b for a, b in turns), "no turns while both waited"
     send(queue, sent, 1000)
     assert [f for f in sent if f.queued] == [f for f in put if f.queued]
-    slots_put, slots_sent = sum(not f.queued for f in put), sum(not f.queued for f in sent)
+    slots_put = sum(not f.queued for f in put)
+    slots_sent = sum(not f.queued for f in sent)
     assert slots_sent + queue.replaced == slots_put
-    assert (len(queue), queue.dropped) == (0, 0)
+    assert len(queue) == 0
+    assert queue.dropped == 0
 
 
-def test_pages_of_a_message_are_no_parts_of_a_transfer_however_many() -> None:
-    """Of 70 pages those that wait give way to newer ones, each for itself."""
+def test_pages_of_a_message_are_never_parts_of_a_transfer() -> None:
+    """Each of 70 waiting pages is replaced by its newer version separately."""
     numbers = range(FIRST_PART + 6)
     rows = "".join(f' SG_ S{n} m{n} : 8|8@1+ (1,0) [0|0] "" X\n' for n in numbers)
     text = f'VERSION ""\nBU_: G X\nBO_ 256 M: 2 G\n SG_ Page M : 0|8@1+ (1,0) [0|0] "" X\n{rows}'
     bind: dict[str, str | float] = {f"S{n}": n for n in numbers}
     (plan,) = compiled(text, bind=bind).messages
     make = compile_frame(plan)
-    queue, sent = TransmitQueue(), list[CanFrame]()
+    queue = TransmitQueue()
+    sent = list[CanFrame]()
     queue.put_all([make((), GatewayStatus(), 0, 0, FIRST_PART + 1)])
     queue.put_all([make((), GatewayStatus(), 0, 0, at) for at in numbers])
     send(queue, sent, 100)

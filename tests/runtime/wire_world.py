@@ -1,6 +1,6 @@
-"""A loop in a world without a clock: wires that bytes come on, the kernel's buffers, a bus, and a process that is held up.
+"""A loop in a world without a clock: serial wires, the kernel's buffers, a bus, a process.
 
-Time goes on only where the loop waits, and where a test says that the process is held up.
+Time passes only while the loop waits, and while a test holds the process up.
 """
 
 import os
@@ -40,7 +40,8 @@ from kontronik_can_gw.times import MS, SECOND
 NS_PER_BYTE = KONTRONIK.byte_ns
 
 NOT_AVAILABLE = 0xFFFFFFFF
-_FIRST_PORT, CAN_FD = 1000, 2000
+_FIRST_PORT = 1000
+CAN_FD = 2000
 _MAX_READ = 4096
 TIMES = """BA_DEF_DEF_ "GenMsgCycleTime" 20;
 BA_DEF_DEF_ "GenMsgSendType" "CyclicAndEvent";
@@ -48,13 +49,16 @@ BA_DEF_DEF_ "GenMsgSendType" "CyclicAndEvent";
 
 
 def speed_and_age(esc: str = "") -> list[Sig]:
-    """The signals of an ESC's speed and of its age in ms."""
+    """Return the signals of an ESC's speed and of the age of its data in ms."""
     speed = Sig(f"{esc}ElectricalSpeed", 0, 32, unit="1/min")
     return [speed, Sig(f"{esc}DataAge", 32, 16, unit="ms")]
 
 
 def layout_of(escs: Sequence[EscSettings]) -> Layout:
-    """For each ESC a message 100h, 101h ... with speed and age, sent with each frame and every 20 ms."""
+    """Return a layout with a message 100h, 101h … of speed and age for each ESC.
+
+    Each frame of the ESC sends its message, and so does a cycle of 20 ms.
+    """
     messages = []
     for n, esc in enumerate(escs):
         name = esc.name if len(escs) > 1 else ""
@@ -63,13 +67,12 @@ def layout_of(escs: Sequence[EscSettings]) -> Layout:
 
 
 def live(speed: int) -> bytes:
-    return encode(
-        LiveData(electrical_speed=speed, battery_voltage=2400, battery_current=100), WireLayout.V4
-    )
+    data = LiveData(electrical_speed=speed, battery_voltage=2400, battery_current=100)
+    return encode(data, WireLayout.V4)
 
 
 class Wire:
-    """A serial port: what comes, and when the kernel has it. Frames have their number as speed."""
+    """A serial port with scheduled bytes. The speed in a frame is the number of the frame."""
 
     drained = True
     settings = bytes(range(64))
@@ -77,34 +80,44 @@ class Wire:
     def __init__(self, world: "World", number: int) -> None:
         self.path = f"/fake/{number}"
         self.arrivals: list[int] = []
-        """When each byte was in the kernel's buffer."""
+        """Times at which each byte was in the kernel's buffer."""
         self.frames: list[int] = []
-        """When each frame was there whole."""
+        """Times at which each frame was complete."""
         self.now_set = self.settings
         self.looks: list[int] = []
-        """When the settings were looked at, or set."""
+        """Times at which the settings were read or set."""
         self.fails_at: int | None = None
-        """From this time on the port is readable and each read fails, which takes a millisecond."""
+        """After this time the port is readable and each read fails, which takes a millisecond."""
         self.hangs_up = False
-        """A read that fails returns nothing, instead of an I/O error."""
+        """A failing read returns no bytes instead of an I/O error."""
         self._world = world
         self._number = number
         self._bytes = bytearray()
         self._read = 0
 
     def send(self, at: int, bundled: bool = False) -> None:
-        """The next frame begins ``at``. Bundled: an adapter hands its bytes over all at once."""
+        """Let the next frame begin ``at`` this time.
+
+        If it is bundled, an adapter delivers all its bytes at once, when the last one is there.
+        """
         data = live(len(self.frames) + 1)
-        self.put(
-            data, [at + (len(data) if bundled else n + 1) * NS_PER_BYTE for n in range(len(data))]
-        )
+        times = [at + (n + 1) * NS_PER_BYTE for n in range(len(data))]
+        if bundled:
+            times = times[-1:] * len(data)
+        self.put(data, times)
         self.frames.append(self.arrivals[-1])
 
     def put(self, data: bytes, times: Iterable[int]) -> None:
         self._bytes += data
         self.arrivals += times
 
-    def stream(self, begin: int, end: int, period: int, bundled: bool = False) -> None:
+    def stream(
+        self,
+        begin: int,
+        end: int,
+        period: int,
+        bundled: bool = False,
+    ) -> None:
         for at in range(begin, end, period):
             self.send(at, bundled)
 
@@ -114,13 +127,13 @@ class Wire:
 
     @property
     def next_arrival(self) -> int | None:
-        """When it becomes readable; in the past where it is."""
+        """The time at which the port becomes readable. In the past if it is readable."""
         times = self.arrivals[self._read : self._read + 1]
         if self.fails_at is not None:
             times.append(self.fails_at)
         return min(times, default=None)
 
-    # as a SerialPort
+    # methods of SerialPort
 
     def fileno(self) -> int:
         return _FIRST_PORT + self._number
@@ -154,16 +167,17 @@ class Wire:
 
     def settings_hold(self) -> bool:
         self.looks.append(self._world.now)
-        held, self.now_set = self.now_set == self.settings, self.settings
+        held = self.now_set == self.settings
+        self.now_set = self.settings
         return held
 
     def close(self) -> None:
-        """Close the port; it works when it is opened again."""
+        """Close the port. It works again when it is opened again."""
         self.fails_at = None
 
 
 class Bus(CanPort):
-    """A CAN interface: ``sent`` with times, ``inbox`` with the times at which frames came."""
+    """A CAN interface. ``sent`` and ``inbox`` have the frames with their times."""
 
     is_socket = True
 
@@ -173,26 +187,32 @@ class Bus(CanPort):
         self.sent: list[tuple[int, CanFrame]] = []
         self.inbox: list[tuple[CanFrame, int]] = []
         self.clock_error = 0
-        """Of the times that are told."""
+        """Error in ns of the times that the kernel reports."""
         self.answer = Sent.OK
         self.refused: list[int] = []
-        """When each frame was refused with ``answer``, which takes 0.1 ms."""
+        """Times at which a frame was refused with ``answer``. A refusal takes 0.1 ms."""
         self.frame_ns = 0
-        """How long a frame takes on the bus; not 0: the kernel takes six in advance."""
+        """Duration of a frame on the bus. Unless it is 0, the kernel buffers six frames."""
         self._out: list[int] = []
-        """When each frame that the kernel has is out."""
+        """Times at which the frames in the kernel will have been sent."""
         self.on_send: Callable[[CanFrame], None] = lambda _frame: None
         self._world = world
 
-    def came(self, can_id: int, data: bytes = b"", at: int | None = None) -> None:
+    def came(
+        self,
+        can_id: int,
+        data: bytes = b"",
+        at: int | None = None,
+    ) -> None:
         self.inbox.append((CanFrame(can_id, data), self._world.now if at is None else at))
 
     def take(self) -> list[tuple[int, bytes]]:
-        """What was sent since the last call."""
-        sent, self.sent = self.sent, []
+        """Return the frames that were sent since the last call."""
+        sent = self.sent
+        self.sent = []
         return [(frame.can_id, frame.data) for _, frame in sent]
 
-    # as a CanPort
+    # methods of CanPort
 
     def fileno(self) -> int:
         return CAN_FD
@@ -211,11 +231,14 @@ class Bus(CanPort):
 
     @property
     def room_at(self) -> int:
-        """When the socket is writable: less than half of what the kernel takes is in it."""
+        """The time at which the socket becomes writable: its buffer is less than half full."""
         return self._out[-3] if len(self._out) > 2 else 0
 
     def _send_each(
-        self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+        self,
+        frames: Sequence[CanFrame],
+        clock: Callable[[], int],
+        latest: int,
     ) -> tuple[int, Sent]:
         for count, frame in enumerate(frames):
             if clock() > latest:
@@ -224,7 +247,8 @@ class Bus(CanPort):
                 self._out = [at for at in self._out if at > self._world.now]
                 if len(self._out) == 6:
                     return count, Sent.FULL
-                self._out.append(max([self._world.now, *self._out[-1:]]) + self.frame_ns)
+                begin = max([self._world.now, *self._out[-1:]])
+                self._out.append(begin + self.frame_ns)
             if self.answer is not Sent.OK:
                 self.refused.append(self._world.now)
                 self._world.now += MS // 10
@@ -244,9 +268,10 @@ class Bus(CanPort):
 
 
 class World:
-    """``now`` is the clock. As a Poller it waits by letting time pass, and ``hold_up`` says for how long the process gets no processor.
+    """The world around a loop. ``now`` is the clock, and waiting lets time pass.
 
-    ``blind``: descriptors that the loop is never told of.
+    ``hold_up`` returns for how long the process does not run after a wait. Descriptors in
+    ``blind`` are never reported to the loop.
     """
 
     def __init__(self, wires: int = 1) -> None:
@@ -255,11 +280,14 @@ class World:
         self.bus = Bus(self)
         self.looks: list[int] = [self.now]
         self.hold_up: Callable[[], int] = lambda: 0
-        """How long the process stands still behind a wait, before it looks at the clock, in ns."""
+        """Returns in ns how long the process is held up after a wait, before it reads the clock."""
         self.poll_fault: Callable[[bool], int] = lambda _is_all: 0
-        """The errno with which a poll in C fails, or 0. True: it asks for all descriptors."""
+        """Returns the errno of a failing poll in C, or 0.
+
+        Its argument is True if the poll is for all descriptors.
+        """
         self.until = 1 << 62
-        """Turns in C end by then."""
+        """The time at which turns in C end."""
         self.opening_ns = 0
         self.there = True
         self.blind: set[int] = set()
@@ -272,39 +300,49 @@ class World:
         return self.now
 
     def register(self, fd: int, handler: Handler, events: int) -> None:
-        self.handlers[fd], self._events[fd] = handler, events
+        self.handlers[fd] = handler
+        self._events[fd] = events
 
     def unregister(self, fd: int) -> None:
         del self.handlers[fd]
 
-    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+    def wait(
+        self,
+        last: int,
+        due: int,
+    ) -> list[tuple[Handler, int]]:
         pause = max(0, due - self.now)
-        self.pass_until(
-            self.now + -(-pause // MS) * MS, self._events.get(CAN_FD, 0) & select.POLLOUT
-        )
+        whole_ms = -(-pause // MS) * MS
+        for_room = self._events.get(CAN_FD, 0) & select.POLLOUT
+        self.pass_until(self.now + whole_ms, for_room)
         self.look()
         self.late = self.now - last - pause
         found = [(fd, self.ready(fd) & self._events[fd]) for fd in self.handlers]
         return [(self.handlers[fd], bits) for fd, bits in found if bits]
 
     def pass_until(self, until: int, for_room: int) -> None:
-        """Time goes by until something comes, or the bus takes frames; then the process may stand still."""
+        """Let time pass until bytes or frames arrive, or the bus takes frames.
+
+        The process may be held up after that.
+        """
         watched = self.handlers.keys() - self.blind
         found = [wire.next_arrival for wire in self.wires if wire.fileno() in watched]
         if CAN_FD in watched and self.bus.inbox:
             found.append(self.bus.inbox[0][1])
         if for_room:
             found.append(self.bus.room_at)
-        self.now = max(self.now, min([until, *(at for at in found if at is not None)]))
+        first = min([until, *(at for at in found if at is not None)])
+        self.now = max(self.now, first)
         self.now += self.hold_up()
 
     def look(self) -> None:
-        """It is asked what is ready."""
-        self.before, self.looked = self.looked, self.now
+        """Note the time of a check for ready descriptors."""
+        self.before = self.looked
+        self.looked = self.now
         self.looks.append(self.now)
 
     def ready(self, fd: int) -> int:
-        """What poll says of a descriptor."""
+        """Return the events that poll reports for a descriptor."""
         if fd in self.blind:
             return 0
         if fd == CAN_FD:
@@ -315,23 +353,33 @@ class World:
 
 
 class FakePoller(Poller):
-    """The World as the loop's poller: it has a clock of the same name."""
+    """The World as the loop's poller."""
 
     def __init__(self, world: World) -> None:
         super().__init__(world.clock)
         self._world = world
 
     def register(
-        self, fd: int, handler: Handler, events: int = select.POLLIN, esc: int | None = None
+        self,
+        fd: int,
+        handler: Handler,
+        events: int = select.POLLIN,
+        esc: int | None = None,
     ) -> None:
         self._world.register(fd, handler, events)
 
     def unregister(self, fd: int) -> None:
         self._world.unregister(fd)
 
-    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+    def wait(
+        self,
+        last: int,
+        due: int,
+    ) -> list[tuple[Handler, int]]:
         ready = self._world.wait(last, due)
-        self.before, self.now, self.late = self._world.before, self._world.looked, self._world.late
+        self.before = self._world.before
+        self.now = self._world.looked
+        self.late = self._world.late
         return ready
 
 
@@ -343,7 +391,7 @@ def loop_in(
     notifier: Notifier | None = None,
     outputs: Sequence[OutputMaker] = (),
 ) -> Loop:
-    """A loop whose ports, bus, and time are the world's. Not open yet."""
+    """Return a loop whose ports, bus and time are the World's. It is not open yet."""
 
     def open_bus(_config: object) -> Bus:
         world.now += world.opening_ns
@@ -354,14 +402,23 @@ def loop_in(
     by_path = {wire.path: wire for wire in world.wires}
     patch.setattr(can_opener, "open_can", open_bus)
     patch.setattr(esc_input, "SerialPort", lambda path, _protocol: by_path[path])
-    if in_c := os.environ.get(load.PURE, "1") != "1":
+    in_c = os.environ.get(load.PURE, "1") != "1"
+    if in_c:
         patch.setattr(load, "library", lambda: (native_world.library(), ""))
     layout = layout or layout_of(escs)
     gateway = Gateway(escs, layout, world.now, outputs=outputs)
     config = CanConfig(interface="virtual", channel="world")
     paths = list(by_path)
     poller = native_world.FakeNativePoller(world, gateway) if in_c else world.poller
-    return Loop(gateway, paths, config, True, clock=world.clock, poller=poller, notifier=notifier)
+    return Loop(
+        gateway,
+        paths,
+        config,
+        True,
+        clock=world.clock,
+        poller=poller,
+        notifier=notifier,
+    )
 
 
 def run(loop: Loop, world: World, until: int) -> None:

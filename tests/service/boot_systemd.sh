@@ -1,9 +1,10 @@
 #!/bin/sh
-# Run by test_under_systemd.py as root in a User Mode Linux whose root is this machine's, read-only: makes /etc and /var
-# writable (for the VM alone), and starts systemd as process 1 of a process space of its own. It runs inside_systemd.py
-# and ends.
+# test_under_systemd.py runs this as root in a User Mode Linux, whose root is this machine's and
+# read-only. It makes /etc and /var writable for the VM alone, and starts systemd as process 1 of a
+# separate process space. systemd runs inside_systemd.py and ends.
 #   boot_systemd.sh PYTHON SCRIPT OUTPUT-FOLDER FOLDER...
-# FOLDER: what the unprivileged service must see and cannot, because a folder above it is closed to others.
+# The unprivileged service needs each FOLDER, but cannot reach it because a folder above it is closed
+# to other users.
 set -eu
 python=$1 script=$2 out=$3
 shift 3
@@ -25,7 +26,8 @@ for folder; do
     mkdir -p "$folder"
     mount --move "/run/kept/$number" "$folder"
 done
-# each "systemctl daemon-reload" would run the machine's generators anew, a dozen processes of which nothing is needed here
+# Each "systemctl daemon-reload" would run the machine's generators again, a dozen processes that are
+# not needed here.
 for folder in /var/lib /var/log /usr/lib/systemd/system-generators; do mount -t tmpfs tmpfs "$folder"; done
 mount -t cgroup2 cgroup2 /sys/fs/cgroup
 echo 0123456789abcdef0123456789abcdef >/etc/machine-id
@@ -50,9 +52,10 @@ StandardError=inherit
 ExecStopPost=/bin/systemctl exit
 TimeoutStartSec=480
 X
-# what this machine's file system or kernel does not have
-for unit in dev-hugepages.mount dev-mqueue.mount systemd-remount-fs.service sys-kernel-debug.mount sys-kernel-tracing.mount \
-    sys-kernel-config.mount sys-fs-fuse-connections.mount systemd-firstboot.service systemd-machine-id-commit.service; do
+# units for features that this machine's file system or kernel lacks
+for unit in dev-hugepages.mount dev-mqueue.mount systemd-remount-fs.service sys-kernel-debug.mount \
+    sys-kernel-tracing.mount sys-kernel-config.mount sys-fs-fuse-connections.mount \
+    systemd-firstboot.service systemd-machine-id-commit.service; do
     ln -s /dev/null $units/$unit
 done
 container=other exec unshare --pid --fork --mount --mount-proc --kill-child \

@@ -1,7 +1,7 @@
-"""Run by systemd in a VM (boot_systemd.sh): installs the service, makes it suffer, removes it, and writes what it saw as JSON.
+"""Installs, disturbs and removes the service. systemd runs this in a VM (boot_systemd.sh).
 
-inside_systemd.py FOLDER        writes FOLDER/facts.json
-inside_systemd.py --probe       what a process in the service's cage can do, as JSON
+inside_systemd.py FOLDER        writes its observations to FOLDER/facts.json
+inside_systemd.py --probe       prints the abilities of a process in the service's sandbox as JSON
 """
 
 import contextlib
@@ -33,7 +33,13 @@ Facts = dict[str, Any]
 
 
 def run(*words: str) -> dict[str, Any]:
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LIMIT_S)
+    done = subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LIMIT_S,
+    )
     return {"code": done.returncode, "out": done.stdout, "talk": done.stderr}
 
 
@@ -48,14 +54,13 @@ def shown(unit: str = UNIT) -> dict[str, str]:
 
 
 def until(condition: Callable[[], bool]) -> float:
-    """How long it took; -1: it did not come."""
+    """Wait until a condition is true. Return the time in s, or -1 if it stays false."""
     start = time.monotonic()
     while time.monotonic() - start < LIMIT_S:
         if condition():
             return time.monotonic() - start
-        time.sleep(
-            0.2
-        )  # the machine has one processor: asking all the time holds up what is waited for
+        # The machine has one processor. Checking all the time would delay the condition.
+        time.sleep(0.2)
     return -1.0
 
 
@@ -69,7 +74,7 @@ def entries() -> list[dict[str, Any]]:
 
 
 def fetched() -> str:
-    """What Prometheus would get, as soon as it is answered; empty without an answer."""
+    """Return the metrics as Prometheus gets them, or "" without an answer."""
     run("ip", "link", "set", "lo", "up")
     found: list[str] = []
 
@@ -108,7 +113,7 @@ def trial(facts: Facts) -> None:
     write_configuration(CONFIGURATION, "vcan0", LINK)
     facts["install now"] = service("install", "--now")
     facts["fresh"] = fresh()
-    until(lambda: "telemetry ok" in shown()["StatusText"])  # which is reported once a second
+    until(lambda: "telemetry ok" in shown()["StatusText"])  # reported once a second
     facts["running"] = shown()
     pid = facts["running"]["MainPID"]
     facts["process"] = Path(f"/proc/{pid}/status").read_text()
@@ -129,7 +134,7 @@ def trial(facts: Facts) -> None:
     facts["killed"] = shown()
 
     pid = facts["killed"]["MainPID"]
-    os.kill(int(pid), 19)  # SIGSTOP: nothing in it goes on
+    os.kill(int(pid), 19)  # SIGSTOP stops all its threads
     facts["running again after freeze"] = until(is_another)
     facts["frozen"] = shown()
     pid = facts["frozen"]["MainPID"]
@@ -148,7 +153,8 @@ def trial(facts: Facts) -> None:
     facts["end of left"] = run("systemctl", "disable", "--now", "kontronik-can-gw@left.service")
     facts["left"] = shown("kontronik-can-gw@left.service")
 
-    os.mknod(FORBIDDEN, 0o666 | stat.S_IFCHR, os.makedev(1, 11))  # all may open it, but the service
+    # All users may open this device, except the service.
+    os.mknod(FORBIDDEN, 0o666 | stat.S_IFCHR, os.makedev(1, 11))
     os.chmod(FORBIDDEN, 0o666)
     facts["probe"] = probed()
     metrics = run("systemctl", "enable", "--now", "kontronik-can-gw-metrics.service")
@@ -171,11 +177,12 @@ def left_over() -> list[str]:
 
 
 def probed() -> Facts:
-    """The probe as an instance of the template unit, with its cage."""
+    """Run the probe as an instance of the template unit, in its sandbox. Return its result."""
     folder = Path("/run/systemd/system/kontronik-can-gw@probe.service.d")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "probe.conf").write_text(
-        f"[Service]\nType=oneshot\nRestart=no\nWatchdogSec=0\nExecStart=\nExecStart={sys.executable} -B {__file__} --probe\n"
+        "[Service]\nType=oneshot\nRestart=no\nWatchdogSec=0\nExecStart=\n"
+        f"ExecStart={sys.executable} -B {__file__} --probe\n"
         "StandardOutput=truncate:/run/probe.json\n"
     )
     run("systemctl", "daemon-reload")
@@ -188,7 +195,7 @@ def probed() -> Facts:
 
 
 def probe() -> None:
-    """What must work and what must not."""
+    """Try actions that must work or must fail in the sandbox, and print the results."""
     tries: dict[str, Callable[[], object]] = {
         "CAN socket": lambda: socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW),
         "netlink": lambda: socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, 0),
@@ -221,7 +228,7 @@ def probe() -> None:
 
 
 def unshared() -> None:
-    """unshare(2) of user name spaces, which Python 3.11 does not know."""
+    """Call unshare(2) for a user name space, which Python 3.11 does not support."""
     import ctypes
 
     libc = ctypes.CDLL(None, use_errno=True)

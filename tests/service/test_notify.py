@@ -1,4 +1,4 @@
-"""What the gateway reports to systemd, read from a socket in place of systemd's; and how its log lines look to the journal."""
+"""Notifications of the gateway to systemd, read from a socket, and its log lines in the journal."""
 
 import logging
 import os
@@ -13,7 +13,7 @@ from kontronik_can_gw.runtime.system.sd_notify import Notifier, is_journal, log_
 
 
 class Manager:
-    """The end that systemd has."""
+    """The socket at systemd's end."""
 
     def __init__(self, address: str) -> None:
         self.environment = {"NOTIFY_SOCKET": address}
@@ -21,7 +21,7 @@ class Manager:
         self.socket.bind("\0" + address[1:] if address.startswith("@") else address)
 
     def told(self) -> list[list[str]]:
-        """The messages since the last call, each as its lines."""
+        """Return the messages since the last call, each as a list of lines."""
         found = []
         while True:
             try:
@@ -41,7 +41,7 @@ def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]
         yield found
 
 
-def test_a_life_is_reported_in_systemds_words(manager: Manager) -> None:
+def test_ready_status_watchdog_and_end_are_notified(manager: Manager) -> None:
     notifier = Notifier(manager.environment | WATCHED | {"WATCHDOG_PID": str(os.getpid())})
     notifier.ready("two ESCs")
     notifier.status("one ESC")
@@ -64,16 +64,17 @@ def test_a_life_is_reported_in_systemds_words(manager: Manager) -> None:
         (("😀" * 5000,), ["😀" * 750]),
     ],
 )
-def test_a_status_is_one_line_that_is_reported_when_it_changes(
-    manager: Manager, texts: tuple[str, ...], told: list[str]
+def test_a_status_is_one_line_that_is_notified_when_it_changes(
+    manager: Manager,
+    texts: tuple[str, ...],
+    told: list[str],
 ) -> None:
     notifier = Notifier(manager.environment)
     for text in texts:
         notifier.status(text)
     found = [line for lines in manager.told() for line in lines]
-    assert [line[: len(text) + 7] for line, text in zip(found, told, strict=True)] == [
-        f"STATUS={text}" for text in told
-    ]
+    for line, text in zip(found, told, strict=True):
+        assert line.startswith(f"STATUS={text}")
     assert all(len(line.encode()) <= 4096 for line in found)
 
 
@@ -81,7 +82,7 @@ def test_a_status_is_one_line_that_is_reported_when_it_changes(
     "address",
     ["", "vsock:2:1", "@", "/no/such/folder/notify", "/" + "x" * 300, "/with\0null"],
 )
-def test_a_socket_that_is_none_or_cannot_be_reached_does_no_harm(address: str) -> None:
+def test_an_unusable_socket_does_no_harm(address: str) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000"})
     for _ in range(3):
         notifier.ready("x")
@@ -94,7 +95,7 @@ def test_a_socket_that_is_none_or_cannot_be_reached_does_no_harm(address: str) -
 
 def test_a_full_socket_never_blocks_and_loses_no_state(manager: Manager) -> None:
     notifier = Notifier(manager.environment | WATCHED)
-    for _ in range(5000):  # more than any queue holds
+    for _ in range(5000):  # more than the capacity of any queue
         notifier.watchdog()
     notifier.ready("up")
     notifier.status("lost")
@@ -108,13 +109,13 @@ def test_a_full_socket_never_blocks_and_loses_no_state(manager: Manager) -> None
     for _ in range(5000):
         notifier.watchdog()
     notifier.ready()
-    notifier.stopping()  # which makes "ready" untrue
+    notifier.stopping()  # after which "ready" is no longer true
     manager.told()
     notifier.stopping()
     assert manager.told() == [["STOPPING=1"]]
 
 
-def test_a_manager_that_comes_back_is_reported_again(tmp_path: Path) -> None:
+def test_a_manager_that_returns_is_notified_again(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     notifier = Notifier({"NOTIFY_SOCKET": str(path)})
     for text in ("one", "three"):
@@ -137,8 +138,9 @@ def test_a_manager_that_comes_back_is_reported_again(tmp_path: Path) -> None:
         ({"WATCHDOG_USEC": "5", "WATCHDOG_PID": "me"}, None),
     ],
 )
-def test_the_watchdog_is_for_the_process_that_is_meant(
-    variables: dict[str, str], half: int | None
+def test_the_watchdog_is_used_only_by_the_named_process(
+    variables: dict[str, str],
+    half: int | None,
 ) -> None:
     assert Notifier({"NOTIFY_SOCKET": "/none"} | variables).watchdog_ns == half
 
@@ -146,8 +148,9 @@ def test_the_watchdog_is_for_the_process_that_is_meant(
 # --- the log
 
 
-def test_each_line_carries_its_priority_where_the_journal_reads(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_each_line_has_its_priority_if_the_journal_reads_it(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     with (tmp_path / "log").open("w") as stream:
         status = os.fstat(stream.fileno())
@@ -158,5 +161,13 @@ def test_each_line_carries_its_priority_where_the_journal_reads(
         formatter = log_formatter(stream)
     assert not is_journal(stream, {"JOURNAL_STREAM": named}), "a closed one"
     assert formatter is not None
-    lost = logging.LogRecord("x", logging.ERROR, __file__, 1, "lost\nfor good", (), None)
+    lost = logging.LogRecord(
+        "x",
+        logging.ERROR,
+        __file__,
+        1,
+        "lost\nfor good",
+        (),
+        None,
+    )
     assert formatter.format(lost) == "<3>lost\n<3>for good"

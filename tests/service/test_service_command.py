@@ -1,4 +1,4 @@
-"""``service`` as a command: staged files, round trips, what people changed, wrong uses."""
+"""The command ``service``: staged files, round trips, files that people changed, wrong uses."""
 
 import os
 from pathlib import Path
@@ -30,7 +30,7 @@ def uninstall(root: Path) -> str:
 
 
 def tree(root: Path) -> list[str]:
-    """What was added to a root folder."""
+    """Return the files and links in a root folder."""
     found = [path for path in root.rglob("*") if path.is_symlink() or path.is_file()]
     return sorted(str(path.relative_to(root)) for path in found)
 
@@ -42,10 +42,11 @@ def edit(root: Path, name: str = "gateway") -> str:
 
 
 def enabled(root: Path) -> dict[str, str]:
-    return {p.name: str(p.readlink()) for p in (root / UNITS).glob("multi-user.target.wants/*")}
+    links = (root / UNITS).glob("multi-user.target.wants/*")
+    return {link.name: str(link.readlink()) for link in links}
 
 
-def test_a_staged_install_writes_files_that_all_may_read(tmp_path: Path) -> None:
+def test_a_staged_install_writes_files_that_all_users_may_read(tmp_path: Path) -> None:
     done = install(tmp_path)
     assert done.code == 0
     names = [CONFIGURATION, *(place for place, _ in planned(""))]
@@ -62,12 +63,14 @@ def test_a_staged_install_writes_files_that_all_may_read(tmp_path: Path) -> None
     assert enabled(tmp_path) == {}
 
 
-def test_an_edited_configuration_stays_and_what_was_another_is_kept_aside(tmp_path: Path) -> None:
+def test_an_edited_configuration_is_kept_and_changed_files_are_backed_up(tmp_path: Path) -> None:
     install(tmp_path)
     text = edit(tmp_path)
     said = install(tmp_path, "--now").err
-    assert said.endswith("kontronik-can-gw.service is enabled. See: systemctl status kontronik-can-gw.service\n")  # fmt: skip
-    assert "new" not in said and "replaced" not in said
+    unit = "kontronik-can-gw.service"
+    assert said.endswith(f"{unit} is enabled. See: systemctl status {unit}\n")
+    assert "new" not in said
+    assert "replaced" not in said
     assert (tmp_path / CONFIGURATION).read_text() == text
     assert enabled(tmp_path) == {"kontronik-can-gw.service": f"/{UNIT}"}
     rules = tmp_path / RULES
@@ -80,7 +83,7 @@ def test_an_edited_configuration_stays_and_what_was_another_is_kept_aside(tmp_pa
         assert rules.with_name(kept).read_text() == before + mine
 
 
-def test_uninstall_removes_what_install_wrote_and_keeps_what_people_wrote(tmp_path: Path) -> None:
+def test_uninstall_removes_installed_files_and_keeps_peoples_files(tmp_path: Path) -> None:
     for place in (OF_0_5_0, NETWORK, f"{NETWORK}.example"):
         (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / place).write_text("of 0.5.0")
@@ -112,12 +115,13 @@ def test_an_instance_has_its_own_configuration(tmp_path: Path) -> None:
     assert enabled(tmp_path) == {}
 
 
-def test_a_link_that_leads_out_of_the_root_is_not_followed(tmp_path: Path) -> None:
+def test_a_link_out_of_the_root_is_not_followed(tmp_path: Path) -> None:
     for name in ("elsewhere", "root"):
         (tmp_path / name).mkdir()
     (tmp_path / "root/etc").symlink_to(tmp_path / "elsewhere")
     done = install(tmp_path / "root")
-    assert (done.code, done.err.count("\n")) == (1, 1)
+    assert done.code == 1
+    assert done.err.count("\n") == 1
     assert "leads out of" in done.err
     assert tree(tmp_path / "elsewhere") == []
 
@@ -137,8 +141,10 @@ def test_a_wrong_use_is_reported_in_the_last_line(words: str, said: str) -> None
 
 
 @pytest.mark.parametrize("action", ["install", "uninstall"])
-def test_it_needs_systemd_and_root(
-    action: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_command_needs_systemd_and_root(
+    action: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(service, "_own_program", lambda: EXECUTABLE)
     monkeypatch.setattr(service, "_BOOTED", tmp_path / "none")
@@ -149,10 +155,14 @@ def test_it_needs_systemd_and_root(
     assert said.startswith(f"only root may do that: sudo {EXECUTABLE} service {action} ")
 
 
-@pytest.mark.parametrize("program", ["bin/x", "/a b", "/a%h/x", "/a/../x", '/a"x', "/a\nExec=/x"])
-def test_a_program_that_a_unit_cannot_hold_is_refused(tmp_path: Path, program: str) -> None:
+@pytest.mark.parametrize(
+    "program",
+    ["bin/x", "/a b", "/a%h/x", "/a/../x", '/a"x', "/a\nExec=/x"],
+)
+def test_a_program_that_a_unit_cannot_contain_is_refused(tmp_path: Path, program: str) -> None:
     done = install(tmp_path, executable=program)
-    assert (done.code, tree(tmp_path)) == (2, [])
+    assert done.code == 2
+    assert tree(tmp_path) == []
     assert "is not an absolute path without spaces" in done.err
 
 

@@ -1,6 +1,7 @@
-"""The installed service under a real systemd, in a virtual machine: it starts, is confined, is restarted, and is removed completely.
+"""The installed service under a real systemd, in a virtual machine.
 
-One run of inside_systemd.py gathers the facts, which takes a minute or two; the tests look at them.
+It starts, is confined, is restarted and is removed completely. One run of inside_systemd.py gathers
+the facts in a minute or two, and the tests check them.
 """
 
 import json
@@ -26,10 +27,11 @@ Facts = dict[str, Any]
 
 
 def obstacle() -> str | None:
-    """Why it cannot be run here, and the remedy."""
+    """Return why these tests cannot run here, with the remedy, or None."""
     search = os.environ.get("PATH", os.defpath) + ":/usr/sbin:/sbin"
     if not all(shutil.which(each, path=search) for each in ("linux.uml", "cc")):
-        return "no User Mode Linux: sudo apt-get install user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
+        packages = "user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
+        return f"no User Mode Linux: sudo apt-get install {packages}"
     if not Path("/lib/systemd/systemd").exists() or shutil.which("systemd-sysusers") is None:
         return "no systemd on this machine: sudo apt-get install systemd"
     if not INSTALLED.exists():
@@ -40,11 +42,10 @@ def obstacle() -> str | None:
 
 
 def hidden_folders() -> list[str]:
-    """What the unprivileged user of the service needs and cannot reach."""
+    """Return the folders that the service's unprivileged user needs but cannot reach."""
     found: list[str] = []
-    for folder in dict.fromkeys(
-        str(Path(name).resolve()) for name in (sys.base_prefix, sys.prefix, str(PROJECT))
-    ):
+    needed = [str(Path(name).resolve()) for name in (sys.base_prefix, sys.prefix, str(PROJECT))]
+    for folder in dict.fromkeys(needed):
         closed = [part for part in Path(folder).parents if not part.stat().st_mode & stat.S_IXOTH]
         if closed and not any(folder.startswith(f"{other}/") for other in found):
             found.append(folder)
@@ -61,8 +62,11 @@ def facts(tmp_path_factory: pytest.TempPathFactory) -> Facts:
     command += [f"--timeout={TIMEOUT_S}", f"--rw={folder}", "--", "sh", f"{HERE}/boot_systemd.sh"]
     command += [sys.executable, f"{HERE}/inside_systemd.py", str(folder), *hidden_folders()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S + 60)
-    file, said = folder / "facts.json", folder / "said"
-    talk = done.stdout + done.stderr + (said.read_text() if said.exists() else "")
+    file = folder / "facts.json"
+    said = folder / "said"
+    talk = done.stdout + done.stderr
+    if said.exists():
+        talk += said.read_text()
     assert file.exists(), talk
     found: Facts = json.loads(file.read_text())
     assert "end" in found, talk
@@ -72,12 +76,12 @@ def facts(tmp_path_factory: pytest.TempPathFactory) -> Facts:
 @pytest.mark.parametrize(
     ("place", "expected"),
     [
-        # an example that nobody edited is not started
+        # an example that was not edited is not started
         ("after install", {"ActiveState": "inactive", "UnitFileState": "disabled"}),
         ("running", {"ActiveState": "active", "UnitFileState": "enabled"}),
         ("killed", {"NRestarts": "1"}),
         ("frozen", {"NRestarts": "2"}),
-        # several side by side
+        # several instances at the same time
         ("both 0", {"ActiveState": "active"}),
         ("both 1", {"ActiveState": "active"}),
         ("left", {"ActiveState": "inactive", "UnitFileState": "disabled"}),
@@ -85,7 +89,7 @@ def facts(tmp_path_factory: pytest.TempPathFactory) -> Facts:
         ("running in the end", {"ActiveState": "active"}),
     ],
 )
-def test_the_state_that_systemd_shows(facts: Facts, place: str, expected: Facts) -> None:
+def test_systemd_shows_the_expected_state(facts: Facts, place: str, expected: Facts) -> None:
     name, _, number = place.rpartition(" ")
     shown = facts[name][int(number)] if number.isdigit() else facts[place]
     assert {key: shown[key] for key in expected} == expected
@@ -102,27 +106,29 @@ def test_the_state_that_systemd_shows(facts: Facts, place: str, expected: Facts)
         ("end", 0, ""),
     ],
 )
-def test_what_an_action_says(facts: Facts, action: str, code: int, said: str) -> None:
+def test_an_action_reports_its_result(facts: Facts, action: str, code: int, said: str) -> None:
     done = facts[action]
     assert (done["code"], said in done["talk"]) == (code, True), done
-    assert facts["same process"], "that of before the faulty configuration"
+    assert facts["same process"], "the process from before the faulty configuration"
 
 
-def test_it_runs_as_its_own_user_without_any_right(facts: Facts) -> None:
+def test_the_service_runs_as_its_own_user_without_any_right(facts: Facts) -> None:
     process = dict(line.split(":\t", 1) for line in facts["process"].splitlines() if ":\t" in line)
     assert "0" not in process["Uid"].split() + process["Gid"].split()
-    assert len(process["Groups"].split()) == 3  # its own and those of serial ports
+    assert len(process["Groups"].split()) == 3  # its own group and the groups of serial ports
     assert {process[f"Cap{kind}"] for kind in ("Inh", "Prm", "Eff", "Bnd", "Amb")} == {"0" * 16}
-    assert (process["NoNewPrivs"], process["Seccomp"]) == ("1", "2")
-    assert (facts["nice"], facts["oom"]) == (-10, "-500")
+    assert process["NoNewPrivs"] == "1"
+    assert process["Seccomp"] == "2"
+    assert facts["nice"] == -10
+    assert facts["oom"] == "-500"
 
 
-def test_telemetry_of_a_port_of_its_group_reaches_the_bus(facts: Facts) -> None:
+def test_telemetry_of_a_port_of_its_groups_reaches_the_bus(facts: Facts) -> None:
     assert facts["fresh"]
     assert "telemetry ok" in facts["running"]["StatusText"]
 
 
-def test_its_folders_are_its_own(facts: Facts) -> None:
+def test_the_folders_of_the_service_have_its_owner_and_mode(facts: Facts) -> None:
     assert facts["folders"] == {
         "/run/kontronik-can-gw": ["0o755", "kontronik-can-gw"],
         "/run/kontronik-can-gw/lock": ["0o755", "kontronik-can-gw"],
@@ -130,20 +136,20 @@ def test_its_folders_are_its_own(facts: Facts) -> None:
     }
 
 
-def test_the_folder_of_locks_outlives_the_service_that_stops(facts: Facts) -> None:
+def test_the_folder_of_locks_remains_when_the_service_stops(facts: Facts) -> None:
     assert any("vcan0" in name and "messages" in name for name in facts["locks"])
-    assert facts["locks after a stop"] == ["x"], "what the probe wrote"
+    assert facts["locks after a stop"] == ["x"], "the file that the probe wrote"
 
 
-def test_a_killed_or_frozen_process_is_replaced_and_shows_where_it_was(facts: Facts) -> None:
+def test_a_killed_or_frozen_process_is_replaced_and_logs_its_stack(facts: Facts) -> None:
     assert facts["running again after kill"] >= 0
     assert facts["fresh after kill"]
-    assert facts["running again after freeze"] >= 5, "not before the watchdog's time is over"
+    assert facts["running again after freeze"] >= 5, "not before the watchdog's time has ended"
     assert any("most recent call first" in str(message) for _, message in facts["log"])
     assert "esc1: telemetry ok" in facts["both"][0]["StatusText"]
 
 
-def test_the_cage_lets_through_what_is_needed_and_nothing_else(facts: Facts) -> None:
+def test_the_sandbox_allows_only_the_needed_actions(facts: Facts) -> None:
     needed = {"CAN socket", "netlink", "abstract socket", "state folder", "runtime folder"}
     needed |= {"lock folder", "terminal", "ctypes", "other processes", "machine-id"}
     refused = dict.fromkeys(("internet", "packet"), "Errno 97")
@@ -157,18 +163,18 @@ def test_the_cage_lets_through_what_is_needed_and_nothing_else(facts: Facts) -> 
 
 
 @pytest.mark.skipif(not shared_object().exists(), reason="the core in C was not built")
-def test_the_cage_lets_the_core_in_c_be_loaded(facts: Facts) -> None:
+def test_the_c_core_can_be_loaded_in_the_sandbox(facts: Facts) -> None:
     assert "core: C" in [message for _, message in facts["log"]]
 
 
-def test_metrics_are_served_and_the_gateway_still_has_no_ip(facts: Facts) -> None:
+def test_metrics_are_served_and_the_gateway_still_cannot_use_ip(facts: Facts) -> None:
     done, text, probe = facts["metrics"]
     assert done["code"] == 0
     assert "kontronik_gateway_escs 1.0" in text
     assert probe == facts["probe"]
 
 
-def test_uninstall_keeps_what_people_wrote(facts: Facts) -> None:
+def test_uninstall_keeps_configuration_and_state(facts: Facts) -> None:
     assert facts["after uninstall"][1] == [
         "/etc/kontronik-can-gw",
         "/var/lib/kontronik-can-gw",

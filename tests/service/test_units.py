@@ -1,4 +1,4 @@
-"""The files as they are installed: judged by systemd's own tools where those are, and read line by line everywhere."""
+"""The installed files, checked line by line, and by systemd's own tools if they are installed."""
 
 import ast
 import os
@@ -23,13 +23,21 @@ MAX_EXPOSED = 2.0
 
 
 def files() -> dict[str, str]:
-    """Texts of all files by their names, *.conf by its folder's."""
-    made = {Path(place): text for place, text in planned("/bin/true")}
-    return {(p.parent if p.suffix == ".conf" else p).name: text for p, text in made.items()}
+    """Return the texts of all files by name. For *.conf it is the name of the folder."""
+    found = {}
+    for place, text in planned("/bin/true"):
+        path = Path(place)
+        if path.suffix == ".conf":
+            path = path.parent
+        found[path.name] = text
+    return found
 
 
 def units(folder: Path, beside: bool = False) -> list[Path]:
-    """The gateway's units in a folder, or those of the services beside it; the template as an instance."""
+    """Write the units of the gateway, or of the services beside it, to a folder. Return the paths.
+
+    The template is written as an instance.
+    """
     found = []
     for name in BESIDE if beside else NAMES:
         found.append(folder / name.replace("@", "@left"))
@@ -51,26 +59,29 @@ def analyze(*words: str) -> "subprocess.CompletedProcess[str]":
         pytest.skip(ENABLE)
     environment = os.environ | {"SYSTEMD_COLORS": "0", "LC_ALL": "C.UTF-8"}
     command = ["systemd-analyze", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    return subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment,
+    )
 
 
 # --- by systemd's tools
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_systemd_finds_nothing_to_complain_about(tmp_path: Path, beside: bool) -> None:
+def test_systemd_finds_no_fault_in_the_units(tmp_path: Path, beside: bool) -> None:
     for unit in units(tmp_path, beside):
         done = analyze("verify", "--man=no", str(unit))
-        ours = [
-            line
-            for line in (done.stdout + done.stderr).splitlines()
-            if "kontronik" in line or str(tmp_path) in line
-        ]
+        lines = (done.stdout + done.stderr).splitlines()
+        ours = [line for line in lines if "kontronik" in line or str(tmp_path) in line]
         assert (done.returncode, ours) == (0, []), done.stderr
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_the_service_is_hardly_exposed(tmp_path: Path, beside: bool) -> None:
+def test_the_service_has_a_low_exposure_level(tmp_path: Path, beside: bool) -> None:
     for unit in units(tmp_path, beside):
         done = analyze("security", "--offline=true", "--no-pager", str(unit))
         found = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
@@ -86,12 +97,12 @@ EVERY = [*NAMES, *BESIDE]
 
 @pytest.mark.parametrize("name", EVERY)
 def test_a_service_never_gives_up_and_has_no_rights_of_root(name: str) -> None:
-    """What its cage forbids is tried under a real systemd: test_under_systemd.py."""
+    """test_under_systemd.py tries the forbidden actions under a real systemd."""
     unit = settings(files()[name])
     kept = {"Restart": "always", "StartLimitIntervalSec": "0", "TimeoutStopSec": "5s"}
     kept |= {"User": "kontronik-can-gw", "Group": "kontronik-can-gw", "NoNewPrivileges": "yes"}
     kept |= {"CapabilityBoundingSet": "", "AmbientCapabilities": ""}
-    if "mqtt" not in name:  # which has to reach a broker
+    if "mqtt" not in name:  # mqtt has to reach a broker
         kept["IPAddressDeny"] = "any"
     kept |= {"ProtectHome": "read-only", "WantedBy": "multi-user.target"}
     kept |= {"LimitCORE": "0"}  # a core dump would fill a memory card and delay the restart
@@ -116,7 +127,7 @@ def test_a_service_may_write_the_locks_that_all_gateways_share(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_gateway_shows_its_statistics_to_all_and_its_store_to_none(name: str) -> None:
+def test_statistics_are_readable_by_all_and_the_store_is_private(name: str) -> None:
     """The plain service's folder stays when it ends, because it holds the locks of all."""
     unit = settings(files()[name])
     kept = {"RuntimeDirectoryMode": "0755", "RuntimeDirectoryPreserve": "yes"}
@@ -124,21 +135,20 @@ def test_the_gateway_shows_its_statistics_to_all_and_its_store_to_none(name: str
     assert {name: unit[name] for name in kept} == {name: [text] for name, text in kept.items()}
 
 
-def test_it_may_open_serial_ports_and_nothing_else() -> None:
-    """What that is good for, and the folder of locks, is tried under a real systemd: test_under_systemd.py."""
+def test_the_service_may_open_serial_ports_and_no_other_device() -> None:
+    """test_under_systemd.py tries the effect, and the folder of locks, under a real systemd."""
     unit = settings(files()[NAMES[0]])
     kinds = ("USB", "ACM", "S", "AMA", "SC", "mxc", "THS")
     assert unit["DeviceAllow"] == [f"char-tty{kind} rw" for kind in kinds]
     assert unit["DevicePolicy"] == ["closed"]
     assert "PrivateDevices" not in unit, "it would hide ports that are plugged in later"
-    # who else has a port open, which may be a getty that sends to the ESC, is seen in /proc
+    # /proc shows other programs that have a port open, such as a getty that sends to the ESC.
     assert unit["ProtectProc"] == ["default"]
     assert "PrivateUsers" not in unit
-    # an adapter may be plugged in when the service runs already: its driver has to be loaded before
+    # An adapter may be plugged in while the service runs. Its driver has to be loaded before that.
+    drivers = {"modprobe@usbserial.service", "modprobe@cdc_acm.service"}
     for name in ("Wants", "After"):
-        assert {"modprobe@usbserial.service", "modprobe@cdc_acm.service"} <= set(
-            unit[name][0].split()
-        )
+        assert drivers <= set(unit[name][0].split())
 
 
 PACKAGE = Path(kontronik_can_gw.__file__).parent
@@ -171,17 +181,18 @@ def reachable(command: str) -> set[Path]:
 
 def named_families(files: set[Path]) -> set[str]:
     """Return the address families that modules name, such as socket.AF_CAN."""
-    return {
-        node.attr
-        for file in files
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Attribute) and node.attr.startswith("AF_")
-    }
+    found = set()
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and node.attr.startswith("AF_"):
+                found.add(node.attr)
+    return found
 
 
 def allowed_families(unit: str) -> set[str]:
     """Return the address families that a unit permits."""
-    return {word for line in settings(unit)["RestrictAddressFamilies"] for word in line.split()}
+    lines = settings(unit)["RestrictAddressFamilies"]
+    return set(" ".join(lines).split())
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -195,11 +206,11 @@ def test_a_unit_permits_the_socket_families_that_its_command_opens(name: str) ->
     assert allowed_families(unit) == named_families(modules) | IN_LIBRARIES[command]
 
 
-def test_the_gateway_may_use_can_rtnetlink_and_the_notify_socket_only() -> None:
+def test_the_gateway_may_use_only_can_rtnetlink_and_the_notify_socket() -> None:
     assert allowed_families(files()[NAMES[0]]) == {"AF_CAN", "AF_NETLINK", "AF_UNIX"}
 
 
-def test_an_instance_has_a_configuration_and_folders_of_its_own() -> None:
+def test_an_instance_has_its_own_configuration_and_folders() -> None:
     plain, own = (settings(files()[name]) for name in NAMES)
     changed = {name for name in plain if plain[name] != own[name]}
     assert changed == {"ExecStart", "StateDirectory", "RuntimeDirectory"}
@@ -207,17 +218,18 @@ def test_an_instance_has_a_configuration_and_folders_of_its_own() -> None:
     assert own["StateDirectory"] == own["RuntimeDirectory"] == ["kontronik-can-gw-%i"]
 
 
-def test_metrics_are_for_this_machine_only() -> None:
+def test_metrics_are_only_served_to_this_machine() -> None:
     for name, config in zip(BESIDE[2:], ("gateway", "%i"), strict=True):
         unit = settings(files()[name])
         command = f"/bin/true metrics -c /etc/kontronik-can-gw/{config}.toml --listen ${{LISTEN}}"
         assert unit["ExecStart"] == [command]
         assert unit["Environment"] == ["LISTEN=127.0.0.1:9123"]
-        assert (unit["IPAddressDeny"], unit["IPAddressAllow"]) == (["any"], ["localhost"])
+        assert unit["IPAddressDeny"] == ["any"]
+        assert unit["IPAddressAllow"] == ["localhost"]
 
 
 def test_udev_rules_keep_modem_manager_away(tmp_path: Path) -> None:
-    """And are well-formed by udev itself, where it can say (udevadm verify, systemd 254)."""
+    """udev also checks the rules if it can (udevadm verify, systemd 254)."""
     text = files()["70-kontronik-can-gw.rules"]
     ignored = [line for line in text.splitlines() if 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line]
     assert [line.split(",")[0] for line in ignored] == ['SUBSYSTEM=="usb"', 'SUBSYSTEM=="tty"']
@@ -225,6 +237,8 @@ def test_udev_rules_keep_modem_manager_away(tmp_path: Path) -> None:
     udevadm = shutil.which("udevadm", path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/bin")
     rules = tmp_path / "70-kontronik-can-gw.rules"
     rules.write_text(text)
-    shown = subprocess.run([udevadm, "-h"], capture_output=True, text=True) if udevadm else None
-    if shown is not None and "verify" in shown.stdout:
-        subprocess.run([str(udevadm), "verify", str(rules)], check=True, capture_output=True)
+    if udevadm is None:
+        return
+    shown = subprocess.run([udevadm, "-h"], capture_output=True, text=True)
+    if "verify" in shown.stdout:
+        subprocess.run([udevadm, "verify", str(rules)], check=True, capture_output=True)

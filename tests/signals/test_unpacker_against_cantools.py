@@ -147,4 +147,25 @@ def test_event_message_is_fresh_for_a_second() -> None:
         assert value(view, "losses") is not None
     assert view.expire(2000 * MS + 250 * MS + 1)
     assert value(view, "losses") is None
-    assert view.next_expiry is None
+    assert not view.expire(3600 * SECOND)
+
+
+@pytest.mark.parametrize("seed", range(1000, 1010))
+def test_columns_of_many_frames_have_the_values_of_each_frame(seed: int) -> None:
+    rng = random.Random(seed)
+    maker = LayoutMaker(rng, ESCS)
+    messages = [maker.message() for _ in range(MESSAGES)]
+    settings = DbcConfig(bind=bindings(messages))
+    random_layout = prepare(read(dbc_text(messages)), "random.dbc", ESCS, settings, fd_allowed=True)
+    shipped_layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout
+    lost = 0
+    for layout in (random_layout, shipped_layout):
+        for part in SignalReader(layout).parts:
+            length = part.plan.length
+            fills = [rng.randbytes(length) for _ in range(6)] + [bytes(length), b"\xff" * length]
+            frames = [int.from_bytes(rng.choice(fills), "little") for _ in range(30)]
+            rows = [part.unpacker.values(bits) for bits in frames]
+            columns = [part.unpacker.column(at, frames) for at in range(part.count)]
+            assert [*zip(*columns, strict=True)] == [*map(tuple, rows)]
+            lost += sum(row.count(None) for row in rows)
+    assert lost > 100

@@ -1,6 +1,7 @@
 """Fixtures for tests on a real vcan.
 
-In the run that is to have it (KCG_VCAN=1) a missing vcan is a failure, elsewhere a skip that says how to enable it.
+With KCG_VCAN=1 a missing vcan is a failure. Otherwise the tests are skipped, and the reason names
+the command that enables them.
 """
 
 import itertools
@@ -24,14 +25,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 def vcan() -> Iterator[str]:
-    """The name of a fresh virtual CAN interface (CAN FD capable), up."""
+    """Yield the name of a new virtual CAN interface, which is up and capable of CAN FD."""
     name = f"kcg{os.getpid() % 10000}n{next(_numbers)}"
-    made = subprocess.run(
-        ["ip", "link", "add", name, "type", "vcan"], capture_output=True, text=True, check=False
-    )
+    command = ["ip", "link", "add", name, "type", "vcan"]
+    made = subprocess.run(command, capture_output=True, text=True, check=False)
     if made.returncode:
-        said = made.stderr.strip() or "ip link add failed"
-        reason = f"no vcan can be made here ({said}): run `make test`, or `tests/vm/run -- pytest tests/vcan`"
+        error = made.stderr.strip() or "ip link add failed"
+        remedy = "run `make test`, or `tests/vm/run -- pytest tests/vcan`"
+        reason = f"no vcan can be made here ({error}): {remedy}"
         if os.environ.get("KCG_VCAN"):
             pytest.fail(reason)
         pytest.skip(reason)
@@ -42,14 +43,17 @@ def vcan() -> Iterator[str]:
 
 @pytest.fixture
 def escs(tmp_path: Path) -> Iterator[list[PtyPort]]:
-    """The port of an ESC, to which nothing may be sent."""
+    """Yield the port of an ESC, to which no byte may be sent."""
     with feeding(tmp_path) as ports:
         yield ports
 
 
 @pytest.fixture
 def start_gateway(tmp_path: Path) -> Iterator[Callable[..., GatewayProcess]]:
-    """A function that starts ``kontronik-can-gw run`` with a configuration text; ended at the test's end."""
+    """Yield a function that starts ``kontronik-can-gw run`` with a configuration text.
+
+    The processes are killed at the end of the test.
+    """
     started: list[GatewayProcess] = []
 
     def start(toml: str, *options: str) -> GatewayProcess:

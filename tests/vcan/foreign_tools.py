@@ -1,4 +1,7 @@
-"""A CANopen master and a decoder of others, run as processes. tests/foreign/install.sh gets them."""
+"""A CANopen master and a decoder of other projects, run as processes.
+
+tests/foreign/install.sh installs them.
+"""
 
 import json
 import os
@@ -20,7 +23,7 @@ NODE_CANOPEN = PACKAGES / "node" / "node_modules" / "canopen"
 
 
 def need(there: bool, what: str) -> None:
-    """Skip a test whose foreign program was not to be had; the test run names it."""
+    """Skip a test if its foreign program is not installed."""
     if not there:
         pytest.skip(f"{what} is not installed: run tests/foreign/install.sh")
 
@@ -33,15 +36,19 @@ class Refused(Exception):
         self.code = code
 
 
-def refusal(transfer: Callable[..., object], *arguments: object, **more: object) -> int | None:
-    """The code of a transfer that is refused."""
+def refusal(
+    transfer: Callable[..., object],
+    *arguments: object,
+    **more: object,
+) -> int | None:
+    """Return the code of a transfer that must be refused."""
     with pytest.raises(Refused) as refused:
         transfer(*arguments, **more)
     return refused.value.code
 
 
 class NodeMaster:
-    """The JavaScript master on an interface: calls of node_master.js and the events it tells."""
+    """The JavaScript master on an interface: calls of node_master.js, and its events."""
 
     def __init__(self, interface: str) -> None:
         command = ["node", str(FOREIGN / "node_master.js"), str(PACKAGES / "node"), interface]
@@ -49,7 +56,11 @@ class NodeMaster:
         self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
         self._ready = threading.Event()
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
         )
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -67,7 +78,7 @@ class NodeMaster:
                 self._answers.put(message)
 
     def __call__(self, call: str, **arguments: Any) -> Any:
-        """The result of a call; raises Refused."""
+        """Return the result of a call. Raise Refused if the node refuses it."""
         assert self._process.stdin
         self._process.stdin.write(json.dumps({"call": call, **arguments}) + "\n")
         answer = self._answers.get(timeout=120)
@@ -75,19 +86,39 @@ class NodeMaster:
             raise Refused(answer["error"], answer.get("code"))
         return answer["result"]
 
-    def upload(self, node: int, index: int, sub: int = 0, block: bool = False) -> bytes:
+    def upload(
+        self,
+        node: int,
+        index: int,
+        sub: int = 0,
+        block: bool = False,
+    ) -> bytes:
         return bytes.fromhex(self("upload", node=node, index=index, sub=sub, block=block))
 
-    def download(self, node: int, index: int, sub: int, data: bytes, block: bool = False) -> None:
-        self("download", node=node, index=index, sub=sub, data=data.hex(), block=block)
+    def download(
+        self,
+        node: int,
+        index: int,
+        sub: int,
+        data: bytes,
+        block: bool = False,
+    ) -> None:
+        self(
+            "download",
+            node=node,
+            index=index,
+            sub=sub,
+            data=data.hex(),
+            block=block,
+        )
 
     def of(self, event: str) -> list[dict[str, Any]]:
-        """The events of one kind so far."""
-        return [told for told in list(self.events) if told["event"] == event]
+        """Return the events of one kind so far."""
+        return [each for each in list(self.events) if each["event"] == event]
 
     def states(self, node: int) -> list[int]:
-        """The NMT states that this node's heartbeat told so far, without repetition."""
-        return [told["state"] for told in self.of("heartbeat") if told["node"] == node]
+        """Return the NMT states of this node's heartbeats so far, without repetition."""
+        return [each["state"] for each in self.of("heartbeat") if each["node"] == node]
 
     def __enter__(self) -> Self:
         return self
@@ -118,21 +149,23 @@ FIELDS = {
     "pdo": "canopen.pdo.data.bytes",
     "malformed": "_ws.malformed",
 }
-"""What is asked of tshark, by our names."""
+"""Fields of tshark by our names."""
 
 
 def tshark(frames: Sequence[Recorded], log: Path) -> list[SimpleNamespace]:
-    """Frames decoded by tshark, from a log: of each ``FIELDS`` as tshark writes them, empty where there is none."""
-    log.write_text(
-        "".join(
-            f"({at:.6f}) can0 {can_id:03X}#{data.hex().upper()}\n" for at, can_id, data in frames
-        )
-    )
+    """Write frames to a log and decode it with tshark.
+
+    Each result has the ``FIELDS`` as tshark prints them. A missing field is empty.
+    """
+    lines = []
+    for at, can_id, data in frames:
+        lines.append(f"({at:.6f}) can0 {can_id:03X}#{data.hex().upper()}\n")
+    log.write_text("".join(lines))
     command = ["tshark", "-r", str(log), "-d", "can.subdissector,canopen", "-T", "fields"]
     command += ["-E", "separator=/t", "-E", "occurrence=f"]
     for name in FIELDS.values():
         command += ["-e", name]
-    # it writes its settings to HOME, which may be read-only
+    # tshark writes its settings to HOME, which may be read-only.
     run = subprocess.run(
         command,
         capture_output=True,
@@ -140,8 +173,11 @@ def tshark(frames: Sequence[Recorded], log: Path) -> list[SimpleNamespace]:
         check=True,
         env={**os.environ, "HOME": str(log.parent)},
     )
-    lines = run.stdout.splitlines()
-    return [SimpleNamespace(**dict(zip(FIELDS, line.split("\t"), strict=True))) for line in lines]
+    decoded = []
+    for line in run.stdout.splitlines():
+        values = dict(zip(FIELDS, line.split("\t"), strict=True))
+        decoded.append(SimpleNamespace(**values))
+    return decoded
 
 
 def has_tshark() -> bool:

@@ -1,4 +1,7 @@
-"""A CAN port on a real socket: filters, own frames, CAN FD, an overrun. (Full queues, floods, lost interfaces: the fault programme.)"""
+"""A CAN port on a real socket: filters, own frames, CAN FD, and an overrun.
+
+The fault programme tests full queues, floods and lost interfaces.
+"""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -18,12 +21,16 @@ from kontronik_can_gw.times import SECOND
 
 
 def peer_on(interface: str) -> RawBus:
-    """Another participant, that hears all."""
+    """Return another participant, which receives all frames except marks."""
     return RawBus(interface, (INVERTED | MARK, 0x7FF))
 
 
 @contextmanager
-def port_on(interface: str, ids: Sequence[int], fd: bool = False) -> Iterator[CanPort]:
+def port_on(
+    interface: str,
+    ids: Sequence[int],
+    fd: bool = False,
+) -> Iterator[CanPort]:
     port = open_can(CanConfig("socketcan", interface, fd=fd))
     try:
         port.set_receive_ids(frozenset(ids))
@@ -33,23 +40,23 @@ def port_on(interface: str, ids: Sequence[int], fd: bool = False) -> Iterator[Ca
 
 
 def readable(port: CanPort, interface: str) -> bool:
-    """Whether the socket has something to read of what was sent so far."""
+    """Return whether the socket has a frame to read after all sent frames were delivered."""
     wait_for_delivery(interface)
     return port.waits_to_be_read
 
 
 def all_of(port: CanPort, interface: str) -> list[CanFrame]:
-    """What waits, to the end."""
+    """Receive all waiting frames."""
     frames: list[CanFrame] = []
     while readable(port, interface):
         for frame, at in port.receive():
-            assert at is not None, "the kernel tells when a frame came"
+            assert at is not None, "the kernel reports the time of a frame"
             assert 0 <= time.monotonic_ns() - at < 60 * SECOND
             frames.append(frame)
     return frames
 
 
-def test_600_ids_are_merged_and_exactly_they_come_in_plain_frames(vcan: str) -> None:
+def test_600_ids_are_merged_and_only_their_plain_frames_are_received(vcan: str) -> None:
     wanted = [0, 0x080, *range(0x081, 0x081 + 3 * 600, 3), 0x7E5]
     with port_on(vcan, wanted) as port, peer_on(vcan) as peer:
         came: list[CanFrame] = []
@@ -65,10 +72,10 @@ def test_600_ids_are_merged_and_exactly_they_come_in_plain_frames(vcan: str) -> 
         port.set_receive_ids(frozenset())
         for can_id in wanted:
             peer.send(can_id)
-        assert not readable(port, vcan), "what is not wanted wakes nobody"
+        assert not readable(port, vcan), "unwanted frames do not wake the process"
 
 
-def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vcan: str) -> None:
+def test_own_frames_are_not_received_but_others_with_the_same_id_are(vcan: str) -> None:
     with (
         port_on(vcan, [0x581]) as port,
         port_on(vcan, [0x581]) as second,
@@ -82,21 +89,22 @@ def test_own_frames_do_not_come_back_but_those_of_others_with_the_same_id_do(vca
         assert [peer.receive(LIMIT_S) for _ in range(2)] == [(0x581, b"own"), (0x702 | REMOTE, b"")]
 
 
-def test_long_frames_leave_and_come_as_can_fd(vcan: str) -> None:
-    long, short = CanFrame(0x123456, bytes(range(64)), True, fd=True), CanFrame(0x10, b"short")
+def test_long_frames_are_sent_and_received_as_can_fd(vcan: str) -> None:
+    long = CanFrame(0x123456, bytes(range(64)), True, fd=True)
+    short = CanFrame(0x10, b"short")
     with port_on(vcan, [], fd=True) as port, port_on(vcan, [long.key, 0x10], fd=True) as other:
         assert [port.send(frame) for frame in (long, short)] == [Sent.OK, Sent.OK]
         assert all_of(other, vcan) == [long, short]
 
 
-def test_an_interface_without_can_fd_is_refused_with_the_command_that_mends_it(vcan: str) -> None:
+def test_an_interface_without_can_fd_is_refused_with_the_remedy(vcan: str) -> None:
     ip("link", "set", vcan, "down")
     ip("link", "set", vcan, "mtu", "16")
     with pytest.raises(RunError, match=f"ip link set {vcan} mtu 72"), port_on(vcan, [], fd=True):
         pass
 
 
-def test_an_interface_that_is_down_or_missing_is_refused_with_a_command_that_works(
+def test_an_interface_that_is_down_is_refused_with_a_working_command(
     vcan: str,
 ) -> None:
     ip("link", "set", vcan, "down")
@@ -109,15 +117,14 @@ def test_an_interface_that_is_down_or_missing_is_refused_with_a_command_that_wor
         assert port.send(CanFrame(0x10, b"short")) is Sent.OK
 
 
-def test_a_block_of_several_clients_fits_into_the_socket_and_an_overrun_is_noticed(
+def test_blocks_of_several_clients_fit_and_an_overrun_is_noticed(
     vcan: str,
 ) -> None:
     with port_on(vcan, [0x601]) as port, peer_on(vcan) as peer:
-        for n in range(381):  # three blocks of 127 segments, more than a socket's usual 278 frames
+        for n in range(381):  # three blocks of 127 segments; a socket usually holds 278 frames
             peer.send(0x601, n.to_bytes(2, "little"))
-        assert [int.from_bytes(frame.data, "little") for frame in all_of(port, vcan)] == list(
-            range(381)
-        )
+        numbers = [int.from_bytes(frame.data, "little") for frame in all_of(port, vcan)]
+        assert numbers == list(range(381))
         assert port.overruns == 0
         for _ in range(3000):
             peer.send(0x601)

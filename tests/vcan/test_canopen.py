@@ -1,4 +1,4 @@
-"""ESCs -> gateway process with two CANopen nodes, the DBC beside them -> vcan -> the canopen library as master."""
+"""A gateway process with two CANopen nodes and the DBC, with the canopen library as master."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +18,7 @@ PDOS = (0x181, 0x281, 0x381, 0x481)
 
 @contextmanager
 def master_on(interface: str) -> Iterator[Any]:
-    """The canopen library's network with the nodes 1 and 2."""
+    """Yield a network of the canopen library with the nodes 1 and 2."""
     network: Any = canopen.Network()
     network.connect(interface="socketcan", channel=interface)
     for number in (1, 2):
@@ -29,7 +29,7 @@ def master_on(interface: str) -> Iterator[Any]:
         network.disconnect()
 
 
-def test_heartbeats_and_nmt_commands(vcan: str, tmp_path: Path) -> None:
+def test_nmt_commands_change_states_and_heartbeats_show_them(vcan: str, tmp_path: Path) -> None:
     identities = Identity(1), Identity(2, Layout.LEGACY, cells=12)
     toml = canopen_table(tmp_path / "store")
     with (
@@ -37,14 +37,16 @@ def test_heartbeats_and_nmt_commands(vcan: str, tmp_path: Path) -> None:
         master_on(vcan) as master,
         run.running() as gateway,
     ):
-        watch, node = run.watch, master[1]
+        watch = run.watch
+        node = master[1]
         wait_for(lambda: len(watch.boot_ups) == 2, "boot-ups")
 
         def states(number: int = 1) -> list[int]:
             return [frame.data[0] for frame in watch.of(0x700 + number)]
 
         def go(state: str) -> None:
-            begin, node.nmt.state = len(states()), state
+            begin = len(states())
+            node.nmt.state = state
             wait_for(lambda: states()[begin:][-1:] == [STATES[state]], state)
 
         for each in (1, 2):
@@ -59,7 +61,7 @@ def test_heartbeats_and_nmt_commands(vcan: str, tmp_path: Path) -> None:
         go("STOPPED")
         before = len(watch.recorded)
         run.feed(0, times=2)
-        master.send_message(0x601, b"\x40\x00\x10\x00\0\0\0\0")  # while STOPPED: never answered
+        master.send_message(0x601, b"\x40\x00\x10\x00\0\0\0\0")  # not answered while STOPPED
         go("PRE-OPERATIONAL")
         assert node.sdo[0x1017].raw == 50
         watch.wait_for_mark()
@@ -69,7 +71,8 @@ def test_heartbeats_and_nmt_commands(vcan: str, tmp_path: Path) -> None:
         for command, kept in (("RESET COMMUNICATION", 50_000), ("RESET", 60_000)):
             node.sdo[0x2100][4].raw = 50_000
             node.sdo[0x1017].raw = 50
-            begin, node.nmt.state = len(states()), command
+            begin = len(states())
+            node.nmt.state = command
             wait_for(lambda begin=begin: BOOT_UP in states()[begin:], command)  # type: ignore[misc]
             assert (node.sdo[0x1017].raw, node.sdo[0x2100][4].raw) == (1000, kept), command
         assert states(2).count(BOOT_UP) == 1, "the other node has not noticed"

@@ -1,4 +1,7 @@
-"""`doctor` on real interfaces: a vcan, and the kernel's slcan driver on an emulated adapter, which has a bit rate and states."""
+"""`doctor` on real interfaces: a vcan, and the kernel's slcan driver on an emulated adapter.
+
+The adapter has a bit rate and controller states.
+"""
 
 import contextlib
 import io
@@ -19,11 +22,12 @@ from kontronik_can_gw.cli import main
 
 @pytest.fixture
 def adapter() -> Iterator[Adapter]:
-    """A serial CAN adapter, the kernel's slcan driver on it."""
+    """Yield a serial CAN adapter that the kernel's slcan driver uses."""
     try:
         bus = Bus("slcan9")
     except OSError as error:
-        reason = f"no slcan here ({error.strerror}): sudo modprobe slcan, or `tests/vm/run -- pytest tests/vcan`"
+        remedy = "sudo modprobe slcan, or `tests/vm/run -- pytest tests/vcan`"
+        reason = f"no slcan here ({error.strerror}): {remedy}"
         if os.environ.get("KCG_VCAN"):
             pytest.fail(reason)
         pytest.skip(reason)
@@ -32,10 +36,10 @@ def adapter() -> Iterator[Adapter]:
 
 
 def doctor(file: Path) -> tuple[dict[str, dict[str, Any]], int]:
-    """Findings of the CAN and port groups by check, and the exit code."""
+    """Return the findings of the CAN and port groups by check, and the exit code."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        # in this process: a new one takes long on a slow machine
+        # It runs in this process, because starting one takes long on a slow machine.
         code = main(["doctor", "-c", str(file), "--json"])
     findings = json.loads(printed.getvalue())["findings"]
     return {f["check"]: f for f in findings if f["check"].startswith(("can.", "port."))}, code
@@ -47,8 +51,10 @@ def configured(folder: Path, interface: str, ports: list[PtyPort]) -> Path:
     return file
 
 
-def test_a_vcan_that_is_down_or_missing_is_an_error_whose_command_mends_it_and_nothing_is_sent(
-    vcan: str, tmp_path: Path, escs: list[PtyPort]
+def test_a_vcan_that_is_down_or_missing_is_an_error_with_the_remedy(
+    vcan: str,
+    tmp_path: Path,
+    escs: list[PtyPort],
 ) -> None:
     file = configured(tmp_path, vcan, escs)
     ip("link", "set", vcan, "down")
@@ -67,18 +73,30 @@ def test_a_vcan_that_is_down_or_missing_is_an_error_whose_command_mends_it_and_n
         assert not {"can.bitrate", "can.restart", "can.state"} & set(found)
 
 
-def test_bit_rate_and_state_of_a_real_driver_are_seen(
-    adapter: Adapter, tmp_path: Path, escs: list[PtyPort]
+def test_bit_rate_and_state_of_a_real_driver_are_judged(
+    adapter: Adapter,
+    tmp_path: Path,
+    escs: list[PtyPort],
 ) -> None:
     file = configured(tmp_path, adapter.name, escs)
     found, code = doctor(file)
     assert code == 1
     assert found["can.up"]["severity"] == "error"
     assert "bitrate 1000000" in found["can.up"]["command"]
-    ip("link", "set", adapter.name, "up", "type", "can", "bitrate", "250000")
+    ip(
+        "link",
+        "set",
+        adapter.name,
+        "up",
+        "type",
+        "can",
+        "bitrate",
+        "250000",
+    )
     found, code = doctor(file)
     assert code == 1
-    assert "250000" in found["can.bitrate"]["text"] and found["can.up"]["severity"] == "ok"
+    assert "250000" in found["can.bitrate"]["text"]
+    assert found["can.up"]["severity"] == "ok"
     subprocess.run(found["can.bitrate"]["command"].replace("sudo ", ""), shell=True, check=True)
     found, code = doctor(file)
     assert code == 0
@@ -86,7 +104,11 @@ def test_bit_rate_and_state_of_a_real_driver_are_seen(
     assert found["can.restart"]["severity"] == "note"
     for letter, state, severity in (("p", "passive", "warning"), ("b", "bus-off", "error")):
         adapter.tell_state(letter, 0, 128)
-        wait_for(lambda state=state: state.upper() in shown(adapter.name), state)  # type: ignore[misc]
+
+        def is_shown(state: str = state) -> bool:
+            return state.upper() in shown(adapter.name)
+
+        wait_for(is_shown, state)
         found, _ = doctor(file)
         assert found["can.state"]["severity"] == severity
         assert state in found["can.state"]["text"]
@@ -95,6 +117,5 @@ def test_bit_rate_and_state_of_a_real_driver_are_seen(
 
 
 def shown(name: str) -> str:
-    return subprocess.run(
-        ["ip", "-d", "link", "show", name], capture_output=True, text=True, check=True
-    ).stdout
+    command = ["ip", "-d", "link", "show", name]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -1,4 +1,7 @@
-"""ESCs -> gateway process with DroneCAN nodes -> vcan -> the package ``dronecan`` as monitor, allocator and asker; 1 and 4 ESCs."""
+"""A gateway process with DroneCAN nodes of 1 and 4 ESCs, and the package ``dronecan``.
+
+The package is monitor, allocator and client.
+"""
 
 from collections.abc import Callable
 from contextlib import closing
@@ -17,8 +20,13 @@ dronecan: Any = import_module("dronecan")
 Start = Callable[..., GatewayProcess]
 
 
-def started(interface: str, ports: list[PtyPort], start: Start, more: str) -> GatewayProcess:
-    """A gateway with DroneCAN only, once all is open."""
+def started(
+    interface: str,
+    ports: list[PtyPort],
+    start: Start,
+    more: str,
+) -> GatewayProcess:
+    """Start a gateway with DroneCAN alone, and wait until its ports are open."""
     tables = f"[dbc]\nenabled = false\n[dronecan]\nenabled = true\nper_esc_nodes = true\n{more}"
     gateway = start(configuration(interface, ports, tables))
     gateway.wait_for_line(f"esc{len(ports)}: /")
@@ -26,16 +34,17 @@ def started(interface: str, ports: list[PtyPort], start: Start, more: str) -> Ga
 
 
 class Peer:
-    """A node of the package on the interface; ``statuses``: the esc.Status messages so far."""
+    """A node of the package on the interface. ``statuses`` has the esc.Status messages so far."""
 
     def __init__(self, interface: str) -> None:
         driver = dronecan.driver.SocketCAN(interface)
         self.node = dronecan.node.Node(driver, node_id=100)
         self.statuses: list[Any] = []
-        self.node.add_handler(
-            dronecan.uavcan.equipment.esc.Status, lambda event: self.statuses.append(event)
-        )
+        self.node.add_handler(dronecan.uavcan.equipment.esc.Status, self.note_status)
         self.monitor = dronecan.app.node_monitor.NodeMonitor(self.node)
+
+    def note_status(self, event: Any) -> None:
+        self.statuses.append(event)
 
     def until(self, condition: Callable[[], object], what: str) -> None:
         def spun() -> bool:
@@ -45,7 +54,7 @@ class Peer:
         wait_for(spun, what)
 
     def known(self) -> set[int]:
-        """Nodes whose GetNodeInfo was answered."""
+        """Return the nodes that answered GetNodeInfo."""
         return {entry.node_id for entry in self.monitor.find_all(lambda e: e.info is not None)}
 
     def ask(self, request: Any, to: int) -> Any:
@@ -60,34 +69,43 @@ class Peer:
 
 
 def expected_rpm(live: LiveData) -> int:
-    """The speed of a motor with 7 pole pairs, negative in the states Sync_Backward and Backward."""
+    """Return the speed of a motor with 7 pole pairs. It is negative in the backward states."""
     rpm = (live.electrical_speed + 3) // 7
     is_backward = live.operating_state in (19, 22)
     return -rpm if is_backward else rpm
 
 
+def has_values(status: Any, live: LiveData) -> bool:
+    """Return whether a status has the values of a live frame."""
+    kelvin = live.power_stage_temperature + 273.15
+    return bool(
+        expected_rpm(live) == status.rpm
+        and abs(live.battery_voltage / 100 - status.voltage) < 0.032
+        and abs(live.battery_current / 10 - status.current) < 0.126
+        and abs(kelvin - status.temperature) < 0.126
+    )
+
+
 def check_statuses(ports: list[PtyPort], peer: Peer) -> None:
-    """Telemetry begins, and each status from now on is a reading that was sent."""
+    """Start telemetry, and check that each later status has the values of a sent frame."""
     for port in ports:
         port.on = True
     peer.statuses.clear()
     peer.until(lambda: len(peer.statuses) >= 60 * len(ports), "esc.Status")
     for event in list(peer.statuses):
         got = event.message
-        assert any(
-            expected_rpm(each) == got.rpm
-            and abs(each.battery_voltage / 100 - got.voltage) < 0.032
-            and abs(each.battery_current / 10 - got.current) < 0.126
-            and abs(each.power_stage_temperature + 273.15 - got.temperature) < 0.126
-            for each in sent_by(ports[got.esc_index])
-        ), got
+        sent = sent_by(ports[got.esc_index])
+        assert any(has_values(got, each) for each in sent), got
     indices = [event.message.esc_index for event in peer.statuses]
     assert set(indices) == set(range(len(ports)))
 
 
 @pytest.mark.parametrize("escs", [1, 4])
-def test_a_foreign_node_sees_asks_and_reads(
-    vcan: str, start_gateway: Start, tmp_path: Path, escs: int
+def test_a_foreign_node_reads_status_info_and_parameters(
+    vcan: str,
+    start_gateway: Start,
+    tmp_path: Path,
+    escs: int,
 ) -> None:
     with feeding(tmp_path, escs) as ports, closing(Peer(vcan)) as peer:
         gateway = started(vcan, ports, start_gateway, "node_id = 20")
@@ -110,8 +128,11 @@ def test_a_foreign_node_sees_asks_and_reads(
 
 
 @pytest.mark.parametrize("escs", [1, 4])
-def test_a_foreign_allocator_gives_the_node_ids(
-    vcan: str, start_gateway: Start, tmp_path: Path, escs: int
+def test_a_foreign_allocator_sets_the_node_ids(
+    vcan: str,
+    start_gateway: Start,
+    tmp_path: Path,
+    escs: int,
 ) -> None:
     with feeding(tmp_path, escs) as ports, closing(Peer(vcan)) as peer:
         gateway = started(vcan, ports, start_gateway, "")

@@ -1,4 +1,7 @@
-"""ESCs on pseudo terminals -> gateway process -> vcan: each value on the bus is one that was sent, in order, decoded by the DBC alone."""
+"""A gateway process with ESCs on pseudo terminals, on a vcan.
+
+Each value on the bus was sent by an ESC, in the same order. Frames are decoded by the DBC alone.
+"""
 
 import signal
 from pathlib import Path
@@ -10,11 +13,12 @@ from vcan_tools import chain, wait_for
 from kontronik_can_gw.esc.kontronik.codec import Layout
 from kontronik_can_gw.esc.kontronik.states import Device
 
-LINK_THERE, LINK_LOST, STOPPING = (2, 3), 4, 2
-"""A link is Degraded rather than Ok when its ESC waits for the bus to show each frame."""
-EIGHT = [
-    Identity(i + 1, (Layout.V4, Layout.LEGACY)[i % 2], cells=6 + i, alarms=i > 5) for i in range(8)
-]
+LINK_THERE = (2, 3)
+"""States Ok and Degraded. A link is Degraded if its ESC waits for the bus to show each frame."""
+LINK_LOST = 4
+STOPPING = 2
+LAYOUTS = (Layout.V4, Layout.LEGACY)
+EIGHT = [Identity(i + 1, LAYOUTS[i % 2], cells=6 + i, alarms=i > 5) for i in range(8)]
 
 
 @pytest.mark.parametrize(
@@ -26,57 +30,67 @@ EIGHT = [
     ],
     ids=["KOSMIK", "JIVEPRO", "eight"],
 )
-def test_every_frame_is_on_the_bus_as_it_was_sent_and_the_last_word_is_that_it_ends(
-    vcan: str, tmp_path: Path, identities: list[Identity], times: int, number: int
+def test_every_frame_is_on_the_bus_and_the_last_status_is_stopping(
+    vcan: str,
+    tmp_path: Path,
+    identities: list[Identity],
+    times: int,
+    number: int,
 ) -> None:
     with chain(vcan, tmp_path, *identities) as run, run.running() as gateway:
         run.feed(times=times)
         every = {can_id for can_id, message in run.watch.table.items()}
-        wait_for(
-            lambda: {frame.can_id for frame in run.watch.recorded} == every,
-            "all messages of the DBC",
-        )
-        for index, identity in enumerate(identities):
-            link = f"Esc{index + 1}Link"
-            wait_for(lambda i=index, d=identity.device: run.watch.info_device(i) == d, "the device")  # type: ignore[misc]
-            wait_for(
-                lambda name=link: run.watch.value(name, "link_state") in LINK_THERE,  # type: ignore[misc]
-                "the link is there",
-            )
+
+        def are_all_sent() -> bool:
+            return {frame.can_id for frame in run.watch.recorded} == every
+
+        def are_devices_known() -> bool:
+            devices = [run.watch.info_device(index) for index in range(len(identities))]
+            return devices == [identity.device for identity in identities]
+
+        def are_links_there() -> bool:
+            names = [f"Esc{number}Link" for number in range(1, len(identities) + 1)]
+            return all(run.watch.value(name, "link_state") in LINK_THERE for name in names)
+
+        def are_newest_shown() -> bool:
+            return [fresh[-1].n for fresh in run.watch.fresh] == newest
+
+        wait_for(are_all_sent, "all messages of the DBC")
+        wait_for(are_devices_known, "the devices")
+        wait_for(are_links_there, "the links are there")
         newest = [len(fed.sent) - 1 for fed in run.escs]
         assert run.watch.values > 2 * times * len(identities)
-        wait_for(
-            lambda: all(fresh[-1].n == n for fresh, n in zip(run.watch.fresh, newest, strict=True)),
-            "the newest values",
-        )
+        wait_for(are_newest_shown, "the newest values")
         assert gateway.end(number) == 0, gateway.log
         run.watch.wait_for_mark()
         assert run.watch.value("GatewayStatus", "gateway_state") == STOPPING
 
 
 NOT_AVAILABLE = bytes.fromhex("ffffffffff80ff")
-"""What EscCurrent says without telemetry."""
+"""Data of EscCurrent without telemetry."""
 
 
-def test_loss_and_return_of_telemetry_are_on_the_bus(vcan: str, tmp_path: Path) -> None:
+def test_loss_and_return_of_telemetry_are_shown_on_the_bus(vcan: str, tmp_path: Path) -> None:
     with chain(vcan, tmp_path, Identity(1), esc="") as run, run.running() as gateway:
         for times in (1, 2):
             run.feed(times=5)
             count = len(run.watch.of(0x680))
+
+            def is_marked(count: int = count) -> bool:
+                later = run.watch.of(0x680)[count:]
+                return [frame.data[3] for frame in later].count(0xFF) >= 3
+
+            def is_logged(times: int = times) -> bool:
+                return gateway.log.count("telemetry lost") >= times
+
             wait_for(lambda: run.watch.value("Esc1Link", "link_state") == LINK_LOST, "it is lost")
-            wait_for(
-                lambda count=count: (  # type: ignore[misc]
-                    [f.data[3] for f in run.watch.of(0x680)[count:]].count(0xFF) >= 3
-                ),
-                "cyclic messages go on with NotAvailable",
-            )
+            wait_for(is_marked, "cyclic messages go on with NotAvailable")
             lost = [frame.data[:7] == NOT_AVAILABLE for frame in run.watch.of(0x688)]
-            assert lost[-2:] == [False, True], "event messages say so once"
-            wait_for(
-                lambda times=times: gateway.log.count("telemetry lost") >= times,  # type: ignore[misc]
-                "the log says so",
-            )
+            assert lost[-2:] == [False, True], "event messages show it once"
+            wait_for(is_logged, "the log says so")
         run.feed()
-        wait_for(
-            lambda: run.watch.value("Esc1Link", "link_state") in LINK_THERE, "it is there again"
-        )
+
+        def is_there() -> bool:
+            return run.watch.value("Esc1Link", "link_state") in LINK_THERE
+
+        wait_for(is_there, "it is there again")

@@ -1,6 +1,7 @@
-"""A CANopen master of others (canopen for node, in JavaScript) against the gateway; tshark decodes what they said.
+"""A CANopen master of another project, canopen for node in JavaScript. tshark decodes the frames.
 
-It comes from tests/foreign/install.sh and shares no code with the gateway or with its usual test master.
+tests/foreign/install.sh installs the master. It shares no code with the gateway or with its usual
+test master.
 """
 
 import itertools
@@ -29,15 +30,23 @@ pytestmark = pytest.mark.extended
 
 Start = Callable[..., GatewayProcess]
 
-PRODUCT, REVISION = 0x4B4F4E01, 0x00010000
+PRODUCT = 0x4B4F4E01
+REVISION = 0x00010000
 LOSES = "telemetry_timeout_ms = 10000"
-"""Where telemetry is to be lost: no machine stands still for so long."""
-BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0, 4, 5, 127
+"""Time-out if telemetry must be lost. It is longer than any hold-up of the machine."""
+BOOT_UP = 0
+STOPPED = 4
+OPERATIONAL = 5
+PRE_OPERATIONAL = 127
 BOOTED = [BOOT_UP, PRE_OPERATIONAL]
-# CiA 301 data types: bytes of a number; strings and domains have any length
 SIZES = {0x01: 1, 0x02: 1, 0x03: 2, 0x04: 4, 0x05: 1, 0x06: 2, 0x07: 4}
-WRITE_ONLY, NO_OBJECT, NO_SUB = 0x06010001, 0x06020000, 0x06090011
-TOO_HIGH, TOO_LOW, TOO_LONG = 0x06090031, 0x06090032, 0x06070012
+"""Bytes of a number by CiA 301 data type. Strings and domains have any length."""
+WRITE_ONLY = 0x06010001
+NO_OBJECT = 0x06020000
+NO_SUB = 0x06090011
+TOO_HIGH = 0x06090031
+TOO_LOW = 0x06090032
+TOO_LONG = 0x06070012
 NO_DATA = 0x08000024
 
 
@@ -49,9 +58,13 @@ def master(vcan: str) -> Iterator[NodeMaster]:
 
 
 def start_nodes(
-    vcan: str, start: Start, ports: list[PtyPort], folder: Path, node_id: int
+    vcan: str,
+    start: Start,
+    ports: list[PtyPort],
+    folder: Path,
+    node_id: int,
 ) -> GatewayProcess:
-    """The gateway with nodes and no DBC, and telemetry running."""
+    """Start the gateway with nodes and without DBC. Telemetry runs."""
     tables = "[dbc]\nenabled = false\n" + canopen_table(folder, node_id)
     gateway = start(configuration(vcan, ports, tables, LOSES))
     gateway.wait_for_line(f"esc{len(ports)}: /")
@@ -64,8 +77,11 @@ def u32(value: int) -> bytes:
     return struct.pack("<I", value)
 
 
-def test_node_canopen_reads_every_object_of_the_eds_and_writes_in_every_way(
-    vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
+def test_node_canopen_reads_every_object_and_writes_in_every_way(
+    vcan: str,
+    master: NodeMaster,
+    start_gateway: Start,
+    tmp_path: Path,
 ) -> None:
     with feeding(tmp_path) as ports:
         start_nodes(vcan, start_gateway, ports, tmp_path / "store", 5)
@@ -75,15 +91,17 @@ def test_node_canopen_reads_every_object_of_the_eds_and_writes_in_every_way(
         objects = master("eds", file=str(EDS))
         assert len(objects) > 200
         for index, sub, name, data_type, access in objects:
-            where = f"{index:04X}:{sub} {name}"
-            if access == "wo" or (index == 0x1003 and sub):  # no error has happened yet
-                code = WRITE_ONLY if access == "wo" else NO_DATA
-                assert refusal(master.upload, 5, index, sub) == code, where
+            place = f"{index:04X}:{sub} {name}"
+            if access == "wo":
+                assert refusal(master.upload, 5, index, sub) == WRITE_ONLY, place
+                continue
+            if index == 0x1003 and sub:  # no error has occurred yet
+                assert refusal(master.upload, 5, index, sub) == NO_DATA, place
                 continue
             got = master.upload(5, index, sub)
-            assert len(got) == SIZES.get(data_type, len(got)), f"{where}: {got.hex()}"
+            assert len(got) == SIZES.get(data_type, len(got)), f"{place}: {got.hex()}"
             if access == "const":
-                assert master.upload(5, index, sub, block=True) == got, where
+                assert master.upload(5, index, sub, block=True) == got, place
         assert refusal(master.upload, 5, 0x2222) == NO_OBJECT
         assert refusal(master.upload, 5, 0x2000, 0x22) == NO_SUB
         assert master.upload(5, 0x1021, block=True) == EDS.read_bytes()
@@ -98,7 +116,11 @@ def test_node_canopen_reads_every_object_of_the_eds_and_writes_in_every_way(
             master.download(5, index, 1, signature)
             begin = len(master.states(5))
             master("nmt", command="resetNode", node=5)
-            wait_for(lambda n=begin: master.states(5)[n:] == BOOTED, "a boot-up")  # type: ignore[misc]
+
+            def has_booted(begin: int = begin) -> bool:
+                return master.states(5)[begin:] == BOOTED
+
+            wait_for(has_booted, "a boot-up")
             assert master.upload(5, 0x2100, 2) == u32(kept)
 
 
@@ -106,9 +128,10 @@ IDENTITY = {"vendorId": 0, "productCode": PRODUCT, "revisionNumber": REVISION}
 
 
 def scanned(master: NodeMaster, serial: int) -> None:
-    """A fastscan that has to find the vendor-ID, 0, bit by bit: every one of its requests is answered.
+    """Find a node by a fastscan that has to determine the vendor-ID 0 bit by bit.
 
-    (One that knows nothing: the examples of docs/canopen.md.)
+    Every request of this scan is answered. The examples of docs/canopen.md scan without any known
+    part.
     """
     known = {"productCode": PRODUCT, "revisionNumber": REVISION, "serialNumber": serial}
     assert master("fastscan", **known) == IDENTITY | {"serialNumber": serial}
@@ -119,8 +142,11 @@ def named(master: NodeMaster, node_id: int) -> None:
     master("waiting")
 
 
-def test_node_canopen_names_nodes_by_lss(
-    vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
+def test_node_canopen_sets_node_ids_by_lss(
+    vcan: str,
+    master: NodeMaster,
+    start_gateway: Start,
+    tmp_path: Path,
 ) -> None:
     with feeding(tmp_path, 2) as ports, recording(vcan) as watch:
         gateway = start_nodes(vcan, start_gateway, ports, tmp_path / "store", 255)
@@ -136,7 +162,7 @@ def test_node_canopen_names_nodes_by_lss(
             wait_for(lambda n=node_id: watch.of(0x700 + n) != [], "a boot-up")  # type: ignore[misc]
         assert master("fastscan", timeout=500) is None
 
-        # a configured node is found by its whole identity, and gets another node-ID that holds from the next reset on
+        # A configured node is found by its whole identity. Its new node-ID applies after a reset.
         master("select", **IDENTITY, serialNumber=SERIAL + 1)
         named(master, 0x41)
         master("nmt", command="resetCommunication", node=0x31)
@@ -148,7 +174,7 @@ def test_node_canopen_names_nodes_by_lss(
 
 
 def session(master: NodeMaster, esc: PtyPort, watch: Witness) -> None:
-    """Something of every service, with a node that waits for its node-ID."""
+    """Use every service with a node that waits for its node-ID."""
     scanned(master, SERIAL)
     master("add", node=0x55)
     named(master, 0x55)
@@ -169,12 +195,18 @@ def session(master: NodeMaster, esc: PtyPort, watch: Witness) -> None:
 
 
 def is_abort(frame: SimpleNamespace) -> bool:
-    """An abort, and not the last segment of a block, which looks like one to tshark: it keeps no state."""
+    """Return whether a frame is an abort.
+
+    tshark keeps no state, and takes the last segment of a block for an abort too.
+    """
     return frame.sdo_abort != "" and int(frame.sdo_command, 0) == 0x80
 
 
-def test_tshark_reads_what_was_said(
-    vcan: str, master: NodeMaster, start_gateway: Start, tmp_path: Path
+def test_tshark_decodes_all_frames_of_a_session(
+    vcan: str,
+    master: NodeMaster,
+    start_gateway: Start,
+    tmp_path: Path,
 ) -> None:
     need(has_tshark(), "tshark")
     with feeding(tmp_path) as ports:
@@ -191,17 +223,23 @@ def test_tshark_reads_what_was_said(
     def of(cob_id: int) -> list[SimpleNamespace]:
         return [f for f in frames if int(f.can_id, 0) == cob_id]
 
-    states = [state for state, _ in itertools.groupby(int(f.state, 0) for f in of(0x755))]
+    every_state = [int(frame.state, 0) for frame in of(0x755)]
+    states = [state for state, _ in itertools.groupby(every_state)]
     assert states == [BOOT_UP, PRE_OPERATIONAL, OPERATIONAL, STOPPED]
     assert [int(f.nmt_command, 0) for f in of(0)] == [1, 2]
-    parts = [(f.sdo_index, f.sdo_sub, f.sdo_abort) for f in of(0x5D5) if is_abort(f)]
-    aborts = [tuple(int(part, 0) for part in each) for each in parts]
+    aborts = []
+    for frame in of(0x5D5):
+        if is_abort(frame):
+            place = int(frame.sdo_index, 0), int(frame.sdo_sub, 0)
+            aborts.append((*place, int(frame.sdo_abort, 0)))
     assert aborts == [(0x2222, 0, NO_OBJECT), (0x2000, 0x22, NO_SUB), (0x2102, 1, WRITE_ONLY)]
     echoed = [f.sdo_abort for f in of(0x655) if is_abort(f)]
-    assert len(echoed) == len(aborts), "the master returns an abort; one more would be its own"
+    assert len(echoed) == len(aborts), "the master only echoes aborts and sends none itself"
     assert {f.sdo_index for f in of(0x655)} >= {"0x1008", "0x2100"}
     assert [int(f.emcy_code, 0) for f in of(0xD5)] == [0x7510]
     assert {int(f.lss_command, 0) for f in of(0x7E4)} == {0x4F, 0x11}
     assert {int(f.lss_command, 0) for f in of(0x7E5)} == {0x51, 0x11, 0x04}
-    pdos = {struct.unpack("<IHh", bytes.fromhex(f.pdo.replace(":", ""))) for f in of(0x1D5)}
-    assert pdos and pdos <= {tuple(d[:3]) for d in sent_by(ports[0])}
+    contents = [bytes.fromhex(frame.pdo.replace(":", "")) for frame in of(0x1D5)]
+    pdos = {struct.unpack("<IHh", data) for data in contents}
+    assert pdos
+    assert pdos <= {tuple(live[:3]) for live in sent_by(ports[0])}

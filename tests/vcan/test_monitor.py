@@ -1,4 +1,4 @@
-"""``monitor`` on a real vcan beside a running gateway: what it shows, that it sends nothing, and that it comes back."""
+"""``monitor`` on a real vcan with a running gateway shows values, sends nothing, and recovers."""
 
 import re
 from collections.abc import Callable
@@ -9,8 +9,10 @@ from vcan_tools import GatewayProcess, configuration, ip, wait_for
 Start = Callable[..., GatewayProcess]
 
 
-def test_it_says_that_the_interface_is_down_or_gone_and_comes_back(
-    vcan: str, escs: list[PtyPort], start_gateway: Start
+def test_a_monitor_reports_a_lost_interface_and_recovers(
+    vcan: str,
+    escs: list[PtyPort],
+    start_gateway: Start,
 ) -> None:
     gateway = start_gateway(configuration(vcan, escs))
     gateway.wait_for_line("esc1: /")

@@ -17,8 +17,8 @@ RECEIVER_PAGE = "docs/testing-your-receiver.md"
 NEEDS_ROS = "examples/ros2/README.md"
 
 GATEWAY = """
-mount -t sysfs sys /sys  # that of this network namespace
-mount -t tmpfs run /run  # the gateway is killed at the end and leaves its status there
+mount -t sysfs sys /sys  # shows this network namespace
+mount -t tmpfs run /run  # the gateway is killed at the end, and its status is left there
 ip link set lo up
 ip link add can0 type vcan
 ip link set can0 up
@@ -54,20 +54,32 @@ END
 python restarted.py
 """
 PATIENT = "import canopen.sdo.client; canopen.sdo.client.SdoClient.RESPONSE_TIMEOUT = 60.0"
-"""Put before an example: the master waits for answers however loaded the machine is."""
+"""Code before an example, so that the master waits for answers even on a busy machine."""
 
 
-def output_of(block: Block, folder: Path, node_id: int = 1, after: str = "") -> str:
-    """What an example prints while a gateway with one ESC is on can0."""
+def output_of(
+    block: Block,
+    folder: Path,
+    node_id: int = 1,
+    after: str = "",
+) -> str:
+    """Run an example with a gateway with one ESC on can0. Return the output of the example."""
     (folder / "example.py").write_text(block.text)
     started = f"python -c \"{PATIENT}; exec(open('example.py').read(), {{}})\""
     shown = Block(block.place, "", f"{started} >example.out\n{after}")
-    run_block(shown, folder, GATEWAY.format(node_id=node_id), "unshare", "--net", "--mount")
+    run_block(
+        shown,
+        folder,
+        GATEWAY.format(node_id=node_id),
+        "unshare",
+        "--net",
+        "--mount",
+    )
     return (folder / "example.out").read_text()
 
 
 def example(*words: str) -> list[Block]:
-    """The examples that contain all of these words."""
+    """Return the examples that contain all of these words."""
     found = [block for block in EXAMPLES if all(word in block.text for word in words)]
     assert found, words
     return found
@@ -82,13 +94,13 @@ def test_every_python_block_is_run_or_needs_ros() -> None:
 
 
 @pytest.mark.parametrize("block", example("Battery voltage"), ids=lambda block: block.place)
-def test_values_are_polled(vcan: str, block: Block, tmp_path: Path) -> None:
+def test_the_example_polls_values(vcan: str, block: Block, tmp_path: Path) -> None:
     said = output_of(block, tmp_path)
     assert re.search(r"^voltage 2\d\.\d+ V$", said, re.MULTILINE)
     assert said.endswith("link 2\n") or "link" not in block.text
 
 
-def test_pdos_are_received(vcan: str, tmp_path: Path) -> None:
+def test_the_example_receives_pdos(vcan: str, tmp_path: Path) -> None:
     (block,) = example("wait_for_reception")
     said = output_of(block, tmp_path).splitlines()
     assert len(said) == 15
@@ -100,7 +112,7 @@ def test_pdos_are_received(vcan: str, tmp_path: Path) -> None:
     assert all(2000 < int(line.rpartition(" ")[2]) < 3000 for line in said if "voltage" in line)
 
 
-def test_emergencies_are_received_and_in_the_history(vcan: str, tmp_path: Path) -> None:
+def test_the_example_receives_emergencies_and_reads_the_history(vcan: str, tmp_path: Path) -> None:
     (block,) = example("emcy")
     said = output_of(block, tmp_path)
     assert re.search(r"^(2220|0000)h, error word", said, re.MULTILINE)
@@ -108,7 +120,7 @@ def test_emergencies_are_received_and_in_the_history(vcan: str, tmp_path: Path) 
     assert "history 1: 2220h" in said
 
 
-def test_settings_and_a_pdo_are_kept_over_a_restart(vcan: str, tmp_path: Path) -> None:
+def test_the_example_stores_settings_and_a_pdo_across_a_restart(vcan: str, tmp_path: Path) -> None:
     (block,) = example("store()")
     output_of(block, tmp_path, after=AFTER_RESTART)
     stored = decode((tmp_path / "store" / "esc1.params").read_bytes())
@@ -117,13 +129,13 @@ def test_settings_and_a_pdo_are_kept_over_a_restart(vcan: str, tmp_path: Path) -
     assert stored.communication[0x180401] == (0x400001A1).to_bytes(4, "little")
 
 
-def test_a_waiting_node_gets_its_id(vcan: str, tmp_path: Path) -> None:
+def test_the_example_sets_the_node_id_of_a_waiting_node(vcan: str, tmp_path: Path) -> None:
     (block,) = example("fast_scan")
     assert output_of(block, tmp_path, node_id=255).startswith("found True")
     assert decode((tmp_path / "store" / "esc1.params").read_bytes()).node_id == 5
 
 
-def test_the_test_of_a_receiver_runs_beside_the_example(vcan: str, tmp_path: Path) -> None:
+def test_the_test_of_a_receiver_runs_with_the_example(vcan: str, tmp_path: Path) -> None:
     shutil.copytree(PROJECT / "examples", tmp_path / "examples")
     (block,) = (block for block in BLOCKS if block.place.startswith(f"{RECEIVER_PAGE}:"))
     folder = tmp_path / "examples" / "receiver"

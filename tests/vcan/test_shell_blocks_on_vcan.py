@@ -1,4 +1,4 @@
-"""Shell blocks of README, docs and examples that need a CAN interface do what they say: values are on vcan0."""
+"""Shell blocks of README, docs and examples that need a CAN interface work as described."""
 
 import csv
 import shutil
@@ -11,8 +11,8 @@ pytestmark = pytest.mark.extended
 
 BEFORE = """
 sudo() { "$@"; }
-# A command in front that never ends is ended by a signal, once it shows an ESC that is heard. The state that
-# `status` shows is up to a second old, and a reader takes longer for the line before.
+# A foreground command that never ends gets a signal when it shows an ESC with telemetry. The state
+# that `status` shows is up to a second old, and a reader needs longer for the line before.
 kontronik-can-gw() {
     case $BASHPID.$1 in $$.run | $$.monitor) ;;
         $$.status) until command kontronik-can-gw "$@"; do sleep 0.1; done; return ;;
@@ -23,7 +23,7 @@ kontronik-can-gw() {
     kill $! 2>/dev/null || :
     wait $! || { cat said; return 1; }
 }
-mount -t sysfs sys /sys  # that of this network namespace
+mount -t sysfs sys /sys  # shows this network namespace
 mount -t tmpfs run /run  # `status` finds no gateway that another test killed
 ip link set lo up
 """
@@ -32,7 +32,8 @@ for channel in can0 can1; do
     ip link add $channel type vcan
     ip link set $channel up
     kontronik-can-gw simulate --link $channel.esc &
-    kontronik-can-gw init - | sed "s#^port = .*#port = \\"$channel.esc\\"#; s#\\"can0\\"#\\"$channel\\"#" >$channel.toml
+    kontronik-can-gw init - |
+        sed "s#^port = .*#port = \\"$channel.esc\\"#; s#\\"can0\\"#\\"$channel\\"#" >$channel.toml
     kontronik-can-gw run --wait -c $channel.toml &
 done
 """
@@ -44,10 +45,12 @@ until [ -e esc1 ]; do sleep 0.1; done
 
 
 def before(text: str) -> str:
-    """What a reader has already: interfaces, and gateways where they are looked at."""
+    """Return the commands before a block: interfaces, and running gateways to monitor."""
     if "ip link add" in text:
         return BEFORE
-    return BEFORE + (RUNNING if "monitor" in text else INTERFACES)
+    if "monitor" in text:
+        return BEFORE + RUNNING
+    return BEFORE + INTERFACES
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +61,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("block", blocks("vcan"), ids=lambda block: block.place)
-def test_a_block_can_be_typed_as_it_stands(
-    vcan: str, block: Block, files: Path, tmp_path: Path
+def test_a_shell_block_can_be_typed_as_it_is(
+    vcan: str,
+    block: Block,
+    files: Path,
+    tmp_path: Path,
 ) -> None:
     folder = tmp_path / "f"
     shutil.copytree(files, folder, symlinks=True)
@@ -69,10 +75,10 @@ def test_a_block_can_be_typed_as_it_stands(
 
 
 def assert_voltages(table: Path) -> None:
-    """README's block for newcomers ends with a table that has the voltages of the simulated ESC.
+    """Check that README's block for newcomers ends with a table of the simulated ESC's voltages.
 
-    The number of rows is not judged: the block ends as soon as an ESC is heard and `status` shows
-    it, which takes a few telemetry frames or many, as the machine is fast or slow.
+    The number of rows is not judged. The block ends as soon as `status` shows telemetry of an ESC,
+    and the number of frames until then depends on the speed of the machine.
     """
     with table.open(newline="") as file:
         rows = list(csv.DictReader(file))

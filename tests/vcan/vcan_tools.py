@@ -1,8 +1,9 @@
 """The bench of the end-to-end tests: ESCs, a gateway process, witnesses of the bus, a master.
 
-No test here passes or fails by how fast the machine is. It waits for an event, with a limit that no working machine reaches, and
-judges order, values and counts. A ``Chain`` sends an ESC's next frame when the bus has shown the one before; what has to be shown
-to not happen is followed by something that has to.
+The result of a test does not depend on the speed of the machine. A test waits for an event, with a
+limit that no working machine reaches, and judges order, values and counts. A ``Chain`` sends an
+ESC's next frame when the bus has shown the one before. To show that an event does not occur, a test
+waits for a later event that must occur.
 """
 
 import itertools
@@ -26,35 +27,47 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 LIMIT_S = 60.0
 NEVER_STALE = "telemetry_timeout_ms = 60000"
-"""For an [[esc]]: a machine that stands still for a while makes no telemetry loss."""
+"""Key of an [[esc]], so that a hold-up of the machine causes no loss of telemetry."""
 
 NO_LIMIT_NS = 3600 * 10**9
-"""The judge of a chain looks at what a value is and in which order it comes, not at its age."""
+"""Slack of a chain's judge, which judges values and their order but not their age."""
 
 
 def ip(*words: str) -> None:
-    """``ip`` with these words."""
+    """Run ``ip`` with these words."""
     subprocess.run(["ip", *words], check=True)
 
 
 def wait_for(condition: Callable[[], object], what: object) -> None:
-    """Wait until something holds. AssertionError when it does not come; ``what`` may be a function that says what is there instead."""
+    """Wait until a condition is true. Raise AssertionError if it stays false.
+
+    ``what`` describes the condition. It may be a function that describes the actual state.
+    """
     end = time.monotonic() + LIMIT_S
     while not condition():
         if time.monotonic() > end:
-            raise AssertionError(f"{what() if callable(what) else what}: not within {LIMIT_S:g} s")
+            text = what() if callable(what) else what
+            raise AssertionError(f"{text}: not within {LIMIT_S:g} s")
         time.sleep(0.005)
 
 
 class GatewayProcess(LoggedProcess):
-    """``kontronik-can-gw run``, or another of its commands, as its own process."""
+    """``kontronik-can-gw run``, or another command of the program, in a separate process."""
 
-    def __init__(self, config: Path | None, *options: object, command: str = "run") -> None:
-        words = [*PROGRAM, command, *([] if config is None else ["-c", config]), *options]
+    def __init__(
+        self,
+        config: Path | None,
+        *options: object,
+        command: str = "run",
+    ) -> None:
+        words: list[object] = [*PROGRAM, command]
+        if config is not None:
+            words += ["-c", config]
+        words += options
         super().__init__([str(word) for word in words], keep_out=command != "run")
 
     def wait_for_line(self, text: str) -> None:
-        """Wait until a log line holds ``text``."""
+        """Wait until a log line contains ``text``."""
 
         def seen() -> bool:
             if self.process.poll() is not None:
@@ -71,7 +84,7 @@ class GatewayProcess(LoggedProcess):
 
 
 class Recorded(NamedTuple):
-    """A frame, and when the kernel had it."""
+    """A frame and the time at which it was read."""
 
     time: float
     can_id: int
@@ -79,12 +92,12 @@ class Recorded(NamedTuple):
 
 
 MARK = 0x7F2
-"""An id of nobody: what was sent before it has been recorded when it has."""
+"""An unused id. When a mark is recorded, all frames that were sent before it are recorded too."""
 _marks = itertools.count(1)
 
 
 def send_mark(interface: str) -> bytes:
-    """Send a mark; its data, which no other mark has."""
+    """Send a mark. Return its data, which no other mark has."""
     data = next(_marks).to_bytes(4, "little")
     with RawBus(interface) as bus:
         bus.send(MARK, data)
@@ -92,17 +105,26 @@ def send_mark(interface: str) -> bytes:
 
 
 def wait_for_delivery(interface: str) -> None:
-    """Wait until every socket on this interface has what was sent so far."""
+    """Wait until every socket on this interface has all frames that were sent so far."""
     with RawBus(interface, (MARK, 0x7FF)) as witness:
         expected = MARK, send_mark(interface)
         wait_for(lambda: witness.receive(1) == expected, "the mark")
 
 
 class Witness(BusWatch):
-    """Keeps the frames of a bus, and judges their values where it is given ESCs (tests/faults/bus_watch.py)."""
+    """Records the frames of a bus, and judges their values if it has ESCs.
+
+    tests/faults/bus_watch.py has the judge.
+    """
 
     def __init__(self, interface: str, table: Table, escs: Sequence[PtyPort]) -> None:
-        super().__init__(interface, table, escs, slack_ns=NO_LIMIT_NS, ignore_local=False)
+        super().__init__(
+            interface,
+            table,
+            escs,
+            slack_ns=NO_LIMIT_NS,
+            ignore_local=False,
+        )
         self.recorded: list[Recorded] = []
         self._mark = b""
         self.start()
@@ -118,14 +140,14 @@ class Witness(BusWatch):
         return [frame for frame in list(self.recorded) if frame.can_id == can_id]
 
     def wait_for_mark(self) -> None:
-        """Wait until all that was sent so far is recorded and judged."""
+        """Wait until all frames that were sent so far are recorded and judged."""
         mark = send_mark(self.interface)
         wait_for(lambda: self._mark == mark, "the mark")
 
 
 @contextmanager
 def recording(interface: str) -> Iterator[Witness]:
-    """All frames on an interface, to the last that is sent in the block."""
+    """Record all frames on an interface that are sent within the block."""
     watch = Witness(interface, {}, [])
     try:
         yield watch
@@ -135,13 +157,16 @@ def recording(interface: str) -> Iterator[Witness]:
 
 
 def configuration(
-    interface: str, ports: Iterable[PtyPort], dbc: str = "", esc: str = NEVER_STALE
+    interface: str,
+    ports: Iterable[PtyPort],
+    dbc: str = "",
+    esc: str = NEVER_STALE,
 ) -> str:
-    """A configuration text for these ports."""
-    parts = [f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 1000000\n{dbc}\n']
-    parts += [
-        f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ngear = 9.8\n{esc}\n' for port in ports
-    ]
+    """Return the text of a configuration for these ports."""
+    can = f'[can]\ninterface = "socketcan"\nchannel = "{interface}"\nbitrate = 1000000\n'
+    parts = [f"{can}{dbc}\n"]
+    for port in ports:
+        parts.append(f'[[esc]]\nport = "{port.path}"\npole_pairs = 7\ngear = 9.8\n{esc}\n')
     return "\n".join(parts)
 
 
@@ -149,10 +174,15 @@ def configuration(
 
 
 class Chain:
-    """ESCs that say what is expected of them, the gateway, and a judge of each value on the bus."""
+    """ESCs that send frames on request, the gateway, and a judge of each value on the bus."""
 
     def __init__(
-        self, interface: str, folder: Path, identities: Sequence[Identity], toml: str, esc: str
+        self,
+        interface: str,
+        folder: Path,
+        identities: Sequence[Identity],
+        toml: str,
+        esc: str,
     ) -> None:
         self.escs = [PtyPort(folder / f"port{n}", each) for n, each in enumerate(identities)]
         for fed in self.escs:
@@ -165,7 +195,7 @@ class Chain:
 
     @contextmanager
     def running(self, *options: str) -> Iterator[GatewayProcess]:
-        """A gateway that has opened everything, killed at the end if it still runs."""
+        """Start a gateway and wait until its ports are open. Kill it at the end if necessary."""
         self.gateway = GatewayProcess(self.config, *options)
         try:
             self.gateway.wait_for_line(f"esc{len(self.escs)}: /")
@@ -176,30 +206,32 @@ class Chain:
 
     @property
     def held_up(self) -> int:
-        """How often the gateway said that it stood still: then it may throw frames away."""
+        """The number of logged hold-ups. The gateway may discard frames after a hold-up."""
         assert self.gateway is not None
         return self.gateway.log.count("suspended")
 
     def feed(self, *escs: int, times: int = 1) -> None:
-        """The next live frame of these ESCs, of all unless given, each time as soon as the bus has shown the ones before."""
+        """Send the next live frames of these ESCs, by default of all.
+
+        Each frame is sent as soon as the bus has shown the one before.
+        """
         chosen = [self.escs[esc] for esc in escs] or self.escs
         for _ in range(times):
             numbers = [len(fed.sent) for fed in chosen]
             held_up = self.held_up
             for fed, number in zip(chosen, numbers, strict=True):
-                while len(fed.sent) == number:  # an info frame now and then
+                while len(fed.sent) == number:  # some frames are info frames
                     fed.send_one()
 
             def shown(numbers: Sequence[int] = numbers, held_up: int = held_up) -> bool:
-                seen = all(
-                    fed.seen[n] == SPEED | CURRENT for fed, n in zip(chosen, numbers, strict=True)
-                )
-                return seen or self.held_up > held_up
+                seen = [fed.seen[n] for fed, n in zip(chosen, numbers, strict=True)]
+                are_seen = all(each == SPEED | CURRENT for each in seen)
+                return are_seen or self.held_up > held_up
 
             wait_for(shown, f"frames {numbers} on the bus")
 
     def check(self) -> None:
-        """No value was wrong, and nothing was sent to an ESC."""
+        """Check that no value was wrong and that no byte was sent to an ESC."""
         self.watch.wait_for_mark()
         assert not self.watch.wrong, self.watch.wrong
         assert not any(esc.received() for esc in self.escs), "something was sent to an ESC"
@@ -212,9 +244,13 @@ class Chain:
 
 @contextmanager
 def chain(
-    interface: str, folder: Path, *identities: Identity, toml: str = "", esc: str = NEVER_STALE
+    interface: str,
+    folder: Path,
+    *identities: Identity,
+    toml: str = "",
+    esc: str = NEVER_STALE,
 ) -> Iterator[Chain]:
-    """A chain, whose values are checked when all went well."""
+    """Yield a chain. Check its values at the end unless the test has failed."""
     made = Chain(interface, folder, identities, toml, esc)
     try:
         yield made
@@ -228,7 +264,10 @@ def chain(
 
 @contextmanager
 def feeding(folder: Path, count: int = 1) -> Iterator[list[PtyPort]]:
-    """ESCs that send 100 frames a second once they are switched on (``on``), and to which nothing may be sent."""
+    """Yield ESCs that send 100 frames a second while they are ``on``.
+
+    No byte may be sent to them.
+    """
     ports = [PtyPort(folder / f"port{n}", Identity(n + 1), rate_hz=100) for n in range(count)]
     for port in ports:
         port.on = False
@@ -243,7 +282,7 @@ def feeding(folder: Path, count: int = 1) -> Iterator[list[PtyPort]]:
 
 
 def sent_by(port: PtyPort) -> list[LiveData]:
-    """All live frames so far."""
+    """Return all live frames that an ESC has sent so far."""
     return [port.live(n) for n in range(len(port.sent))]
 
 
@@ -254,5 +293,6 @@ SERIAL = 0x00100200
 
 
 def canopen_table(store: Path, node_id: int = 1, more: str = "") -> str:
-    """The table of a configuration that makes each ESC a node, from ``node_id`` on."""
-    return f'[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\nstore = "{store}"\n{more}\n'
+    """Return the table of a configuration with a node for each ESC, beginning at ``node_id``."""
+    text = f"[canopen]\nenabled = true\nnode_id = {node_id}\nserial = {SERIAL}\n"
+    return f'{text}store = "{store}"\n{more}\n'

@@ -1,6 +1,7 @@
 #!/usr/bin/busybox sh
-# Process 1 of both kinds of VM. The root is the host's /, read-only; VM_BACKEND and VM_JOB come from the kernel's
-# command line. /run/job is the host's job folder: job.sh (what to run), ro and rw (folders to mount), rc (the result).
+# Process 1 of both kinds of VM. The root is the host's / and read-only. VM_BACKEND and VM_JOB are set
+# on the kernel's command line. /run/job is the host's job folder with job.sh (the script to run), ro
+# and rw (folders to mount), and rc (the result).
 b=/usr/bin/busybox
 
 if [ "$VM_BACKEND" = uml ]; then
@@ -14,7 +15,7 @@ for d in /dev/shm /tmp /var/tmp /run; do $b mount -t tmpfs tmpfs $d; done
 $b mkdir -p /run/job
 
 if [ "$VM_BACKEND" = uml ]; then
-    # Nothing loads by itself in here: all that can be needed, in the order of its dependencies.
+    # Modules are not loaded automatically. Load all that may be needed, in order of dependency.
     modules=/usr/lib/uml/modules/$($b uname -r)
     names="can can-raw can-bcm can-gw can-isotp can-j1939 can-dev vcan vxcan slcan sch_tbf sch_netem"
     files=$($b grep -oE "^[^:]*/($(echo $names | $b tr ' ' '|'))\.ko[^:]*" "$modules/modules.dep")

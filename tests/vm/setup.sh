@@ -1,11 +1,12 @@
 #!/bin/sh
-# Installs what tests/vm/run needs on Debian and Ubuntu:  setup.sh [uml] [xstate] [qemu]
-#   (nothing)  can-utils, iproute2: enough where the running kernel has vcan
-#   uml        User Mode Linux, 41 MB, and a C compiler: what `make test` uses where the kernel has no vcan
-#   xstate     what it needs to start on a processor with AMX (uml_xstate.c)
-#   qemu       QEMU and Debian's stock kernel, 90 MB: serial ports and CAN controllers besides vcan
-# Needs root, or a sudo without a password, if a package is missing. The kernel for QEMU is downloaded and unpacked, not installed.
-# VM_CACHE: where it goes (tests/vm/.cache). VM_APT_UPDATED=1: the package lists are fresh.
+# Installs the programs for tests/vm/run on Debian and Ubuntu:  setup.sh [uml] [xstate] [qemu]
+#   (nothing)  can-utils and iproute2, which are enough if the running kernel has vcan
+#   uml        User Mode Linux, 41 MB, and a C compiler; `make test` uses it without vcan
+#   xstate     the library that it needs on a processor with AMX (uml_xstate.c)
+#   qemu       QEMU and Debian's stock kernel, 90 MB, for serial ports, CAN controllers and vcan
+# Needs root, or a sudo without a password, if a package is missing. The kernel for QEMU is downloaded
+# and unpacked, not installed. VM_CACHE is the folder for it (tests/vm/.cache). VM_APT_UPDATED=1 means
+# that the package lists are fresh.
 set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
@@ -66,7 +67,8 @@ if [ -z "$version" ]; then
     echo "setup.sh: no linux-image-amd64 in this distribution; the QEMU part is for Debian on amd64" >&2
     exit 1
 fi
-# Besides vcan and slcan: the CAN controllers, the serial adapter, and USB devices played by a test (vhci_hcd).
+# Modules for vcan, slcan, the CAN controllers, the serial adapter, and simulated USB devices
+# (vhci_hcd).
 modules="virtio_pci virtio_console 9pnet_virtio 9p can can_raw can_bcm can_gw can_isotp can_j1939 vcan vxcan slcan sch_tbf
 sch_netem kvaser_pci ftdi_sio vhci_hcd"
 [ -e "$cache/$version/initrd.cpio" ] && [ "$(cat "$cache/$version/modules" 2>/dev/null)" = "$modules" ] && exit 0
@@ -81,7 +83,7 @@ depmod -b "$work" "$version"
 
 mkdir "$work/out"
 python3 - "$work/boot/vmlinuz-$version" "$work/out/vmlinux" <<'PYTHON'
-# The uncompressed ELF file boots by PVH: nothing is decompressed under emulation.
+# The uncompressed ELF file boots by PVH, so the emulated machine need not decompress it.
 import subprocess
 import sys
 

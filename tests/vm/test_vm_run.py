@@ -38,7 +38,9 @@ def test_without_a_virtual_machine_the_remedy_is_named(
 
 
 def test_without_venv_a_line_names_make_test_before_the_command_runs(
-    no_vcan_here: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    no_vcan_here: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(vm_run, "installed", lambda: ["uml"])
     monkeypatch.setattr(vm_run, "run_in_vm", lambda *_: (127, True))

@@ -1,13 +1,17 @@
-/* Gives User Mode Linux a time of its own, which does not depend on how fast or busy the machine is.
+/* Gives User Mode Linux a virtual time that does not depend on the speed or load of the machine.
 
-   Time passes in it by the processor time that it is given, an eighth of it, and waiting is skipped: when nothing is left to do, it
-   is at once the time of the next timer. So what happens in there, and when, is the same on a loaded machine as on a quiet one, and an
-   hour of sleep takes no time. An eighth, because a system call takes many times as long in User Mode Linux, and a test bench shares
-   its only processor; a program in an endless loop still comes to the end of its time. Until it is first idle, while it boots, its
-   time is processor time: the kernel measures some of its functions by the clock, which would take eight times as long.
+   An eighth of its processor time counts as time, and waiting is skipped: if no process has work,
+   the time is set to the next timer. So events in the virtual machine have the same times on a
+   loaded machine as on a quiet one, and an hour of sleep takes no time.
 
-   Preloaded; built and used by vm_run.py. That all of User Mode Linux's time comes from these functions was looked up in
-   arch/um/os-Linux/time.c of Linux 6.1: one timer, and sigsuspend to be idle. */
+   The factor is an eighth because a system call takes many times as long in User Mode Linux, and a
+   test bench shares the only processor. Time still passes for a program in an endless loop. During
+   the boot, before the virtual machine is idle for the first time, the time is the processor time.
+   The kernel measures some of its functions by the clock then, and a slower time would make that
+   take eight times as long.
+
+   vm_run.py builds this file and preloads it. User Mode Linux takes its time from these functions
+   alone: one timer, and sigsuspend when it is idle (arch/um/os-Linux/time.c of Linux 6.1). */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <signal.h>
@@ -18,17 +22,22 @@
 
 #define SECOND 1000000000LL
 #define NEXT(name) \
-	({ static __typeof__(&name) next; next = next ? next : (__typeof__(&name))dlsym(RTLD_NEXT, #name); next; })
+	({ \
+		static __typeof__(&name) next; \
+		next = next ? next : (__typeof__(&name))dlsym(RTLD_NEXT, #name); \
+		next; \
+	})
 
 enum { PLACES = 1 << 16 };
 
-static struct { pid_t pid; int64_t used; } guests[PLACES]; /* by pid: each of the guest's processes is one of the host's */
+/* Processor time by pid. Each process of the guest is a process of the host. */
+static struct { pid_t pid; int64_t used; } guests[PLACES];
 static int64_t used_by_guests;
-static int64_t monotonic, real; /* of the host at the start */
+static int64_t monotonic, real; /* the host's times at the start */
 static int64_t earlier;         /* time that passed until `counted`, or was skipped */
 static int64_t counted;         /* processor time used when `slower` was set */
 static int64_t slower = 1;
-static int64_t due, interval;   /* of the timer; 0: it is not set */
+static int64_t due, interval;   /* of the timer, or 0 if it is not set */
 
 static int64_t ns(const struct timespec *t) { return t->tv_sec * SECOND + t->tv_nsec; }
 
@@ -60,13 +69,14 @@ int clock_gettime(clockid_t clock, struct timespec *t)
 	return 0;
 }
 
-/* A process of the guest has stopped, for a system call as a rule. */
+/* Counts the processor time of a guest's process that has stopped, usually for a system call. */
 pid_t waitpid(pid_t pid, int *status, int options)
 {
 	pid_t stopped = NEXT(waitpid)(pid, status, options);
 	if (stopped > 0) {
 		__typeof__(*guests) *guest = &guests[stopped % PLACES];
-		int64_t all = host(~(clockid_t)stopped << 3 | 2); /* its clock of processor time: clock_getcpuclockid(3) */
+		/* the clock of its processor time, see clock_getcpuclockid(3) */
+		int64_t all = host(~(clockid_t)stopped << 3 | 2);
 		if (guest->pid == stopped && all > guest->used)
 			used_by_guests += all - guest->used;
 		guest->pid = stopped;
@@ -75,7 +85,7 @@ pid_t waitpid(pid_t pid, int *status, int options)
 	return stopped;
 }
 
-/* The host's timer interrupts a guest that computes; it may come too early, and then is set again. */
+/* The host's timer interrupts a guest that computes. If it expires too early, it is set again. */
 int timer_settime(timer_t timer, int flags, const struct itimerspec *to, struct itimerspec *was)
 {
 	int64_t wait = ns(&to->it_value);
@@ -93,7 +103,7 @@ int timer_gettime(timer_t timer, struct itimerspec *is)
 	return 0;
 }
 
-/* It is idle: nothing happens until its timer, if that is set. SIGALRM is blocked so far. */
+/* The guest is idle until its timer expires, if that is set. SIGALRM is blocked until then. */
 int sigsuspend(const sigset_t *mask)
 {
 	if (slower == 1) {

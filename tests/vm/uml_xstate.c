@@ -1,8 +1,12 @@
-/* Lets User Mode Linux 6.1 start on a processor with more state than it knows (AMX: 11 KiB of XSAVE area, where UML keeps 2.7).
+/* Lets User Mode Linux 6.1 start on a processor with more state than it supports.
 
-   The host's kernel takes the registers of a traced process only as a whole (PTRACE_SETREGSET of NT_X86_XSTATE: EFAULT for a
-   shorter area); UML then ends with a panic in put_fp_registers. Preloaded, this fills up what UML leaves out: with zeros, for a
-   guest that uses none of it has none of its bits set in the area's header. Built by tests/vm/setup.sh, used by vm_run.py. */
+   With AMX the XSAVE area has 11 KiB, but UML stores only 2.7 KiB. The host's kernel accepts the
+   registers of a traced process only as a whole: PTRACE_SETREGSET of NT_X86_XSTATE fails with
+   EFAULT for a shorter area. UML then panics in put_fp_registers.
+
+   This library is preloaded and fills the missing part with zeros. A guest that does not use this
+   state has no bit for it in the header of the area. tests/vm/setup.sh builds it, and vm_run.py
+   uses it. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <elf.h>

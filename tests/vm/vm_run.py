@@ -1,28 +1,35 @@
-"""Run a command under a Linux kernel that has vcan: this one if it has, else User Mode Linux, else QEMU.
+"""Run a command under a Linux kernel that has vcan: this one, User Mode Linux or QEMU.
 
     tests/vm/run [--backend auto|native|uml|qemu] [--timeout S] [--rw DIR]... -- COMMAND...
-    tests/vm/run --which            which of them `auto` takes, or none
+    tests/vm/run --which            prints the backend that `auto` chooses, or none
 
-Prints what COMMAND prints, stdout and stderr apart, and exits with its exit code; 124: time-out; 125: the VM failed.
-COMMAND finds the programs of .venv first. `make test` sets up .venv and a virtual machine.
+Prints the output of COMMAND, with stdout and stderr separate, and exits with its exit code. The
+exit code is 124 after a time-out, and 125 if the VM failed. COMMAND finds the programs of .venv
+first. `make test` sets up .venv and a virtual machine.
 
-native  COMMAND itself. Without the right to make interfaces: in a network namespace of its own, by `unshare` or `sudo`.
-uml     User Mode Linux, 2 s to boot, Python at full speed. vcan, CAN FD, vxcan, gateway, BCM, J1939, slcan, tbf, netem.
-        It has a time of its own (uml_time.c; needs a C compiler): what happens in there does not depend on how fast or busy
-        the machine is, and to wait takes no time. Only --timeout is the machine's.
-qemu    Emulated, Python 15 times slower. The same and ISO-TP; two kvaser_pci controllers on one bus (can0, can1);
-        a 16550A UART (/dev/ttyS1, its other end /dev/virtio-ports/com1). USB devices played by the command itself can be
-        plugged in by vhci_hcd (driver ftdi_sio). Its time is the instructions that it has executed, 2 ns each.
+native  COMMAND itself. If it may not create interfaces, it runs in a separate network namespace, by
+        `unshare` or `sudo`.
+uml     User Mode Linux. It boots in 2 s and runs Python at full speed. It has vcan, CAN FD, vxcan,
+        gateway, BCM, J1939, slcan, tbf and netem. Its time is virtual (uml_time.c, which needs a C
+        compiler): the result does not depend on the speed or load of the machine, and waiting takes
+        no time. Only --timeout is in the machine's time.
+qemu    An emulated machine, in which Python is 15 times slower. It has the same features and
+        ISO-TP, two kvaser_pci controllers on one bus (can0, can1), and a 16550A UART (/dev/ttyS1,
+        with the other end at /dev/virtio-ports/com1). The command can simulate USB devices and plug
+        them in by vhci_hcd (driver ftdi_sio). Its time is the number of executed instructions, 2 ns
+        each.
 
-A VM sees the host's file system read-only at the same paths, with an empty /tmp, /var/tmp, /run and /dev/shm; each
---rw DIR is writable. It is root in there, lo is up, the CAN modules are loaded, and there is no vcan interface yet.
-Of the environment it gets PATH, HOME, LANG, CI, VIRTUAL_ENV and what starts with KCG_, PYTHON, PYTEST_, HYPOTHESIS_
-or COVERAGE_. Python finds no asammdf in there, which python-can imports where it is installed, and with it numpy and pandas:
-4 s of each process in UML, a minute in QEMU.
+In a VM the host's file system is read-only at the same paths, with an empty /tmp, /var/tmp, /run
+and /dev/shm. Each --rw DIR is writable. COMMAND is root, lo is up, the CAN modules are loaded, and no
+vcan interface exists yet. The environment has PATH, HOME, LANG, CI, VIRTUAL_ENV and the variables
+that begin with KCG_, PYTHON, PYTEST_, HYPOTHESIS_ or COVERAGE_. Python does not find asammdf.
+python-can would import it if it is installed, and numpy and pandas with it, which would take 4 s of
+each process in UML and a minute in QEMU.
 
-Kept in mind in here: UML does not save the AVX-512 registers over a signal, so glibc and OpenSSL are told to leave
-them alone, and number crunchers with a dispatcher of their own, as numpy, must stay outside. /dev/kvm may be there
-and not work: QEMU always emulates. SIGKILL leaves UML's children behind: SIGTERM comes first.
+Limits of the virtual machines: UML does not save the AVX-512 registers over a signal, so glibc and
+OpenSSL are configured not to use them. Libraries that choose instructions themselves, such as
+numpy, cannot be used. /dev/kvm may exist without working, so QEMU always emulates. SIGKILL leaves UML's
+children behind, so SIGTERM is sent first.
 """
 
 import argparse
@@ -58,12 +65,12 @@ UML_MEMORY_MIB = 512
 QEMU_MEMORY_MIB = 1024
 
 GLIBC_WITHOUT_AVX512 = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW"
-# CPUID leaf 7, EBX: the bits of AVX512 F, DQ, IFMA, PF, ER, CD, BW, VL
 OPENSSL_WITHOUT_AVX512 = ":~0xdc230000"
+"""The bits of AVX512 F, DQ, IFMA, PF, ER, CD, BW and VL in EBX of CPUID leaf 7."""
 
 
 def passed_on() -> dict[str, str]:
-    """The variables that COMMAND gets where it does not simply inherit them."""
+    """Return the variables that COMMAND gets if it does not simply inherit the environment."""
     return {name: value for name, value in os.environ.items() if PASSED_ON.match(name)}
 
 
@@ -71,12 +78,12 @@ SET_UP = "`make test` sets up .venv and a kernel with vcan."
 
 
 def is_in_venv() -> bool:
-    """Whether this Python is a virtual environment's, which has the project and its test tools."""
+    """Return whether this Python is in a virtual environment with the project and its tools."""
     return sys.prefix != sys.base_prefix
 
 
 def extend_path() -> None:
-    """Puts the virtual environment's programs first in PATH, and the folders of `ip` and `tc` last."""
+    """Put the virtual environment's programs first in PATH, and the folders of `ip` last."""
     folders = [os.path.join(sys.prefix, "bin")] if is_in_venv() else []
     folders += os.environ.get("PATH", "").split(os.pathsep)
     folders += ["/usr/sbin", "/usr/bin", "/sbin", "/bin"]
@@ -87,9 +94,12 @@ def extend_path() -> None:
 
 
 def native_prefix() -> list[str] | None:
-    """What to put before a command so that it can make vcan interfaces here ([] if nothing); None if it cannot."""
+    """Return the prefix that a command needs to create vcan interfaces on this kernel.
+
+    The list is empty if no prefix is needed. None if the command cannot create them.
+    """
     try:
-        # AF_CAN, CAN_RAW, also where Python was built without them
+        # AF_CAN and CAN_RAW as numbers, because Python may be built without them
         socket.socket(29, socket.SOCK_RAW, 1).close()
     except OSError:
         return None
@@ -98,13 +108,17 @@ def native_prefix() -> list[str] | None:
     rights = "--inh-caps=+net_admin,+net_raw --ambient-caps=+net_admin,+net_raw"
     ids = f"--reuid={os.getuid()} --regid={os.getgid()} --init-groups"
     as_root = f"sudo -n unshare --net setpriv {ids} {rights} env".split()
-    as_root += [f"{name}={value}" for name, value in passed_on().items()] + with_lo
+    as_root += [f"{name}={value}" for name, value in passed_on().items()]
+    as_root += with_lo
     interface = f"vm{os.getpid()}"
     probe = ["sh", "-c", f"ip link add dev {interface} type vcan && ip link del {interface}"]
     for prefix in ([], namespace, as_root):
         with contextlib.suppress(OSError):
             done = subprocess.run(
-                prefix + probe, check=False, stdin=subprocess.DEVNULL, capture_output=True
+                prefix + probe,
+                check=False,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
             )
             if done.returncode == 0:
                 return prefix
@@ -124,8 +138,12 @@ def uml_command(job: str, out: int, err: int) -> list[str]:
 
 
 def uml_host_environment(job: str) -> dict[str, str]:
-    """Its own, outside of the guest; uml_xstate.so is there where it does not start without."""
-    own_time, help_to_start = os.path.join(job, "time.so"), os.path.join(cache(), "uml_xstate.so")
+    """Return UML's own environment, outside of the guest.
+
+    uml_xstate.so exists only on machines on which UML does not start without it.
+    """
+    own_time = os.path.join(job, "time.so")
+    help_to_start = os.path.join(cache(), "uml_xstate.so")
     source = os.path.join(HERE, "uml_time.c")
     subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", own_time, source, "-ldl"], check=True)
     preload = filter(os.path.exists, (own_time, help_to_start))
@@ -133,7 +151,10 @@ def uml_host_environment(job: str) -> dict[str, str]:
 
 
 def uml_memory_folder(job: str) -> str:
-    """Where UML keeps its memory file: /dev/shm if it has the room and allows to execute, as in a container it may not."""
+    """Return the folder of UML's memory file.
+
+    It is /dev/shm if that has enough room and allows execution, which a container may forbid.
+    """
     with contextlib.suppress(OSError):
         shm = os.statvfs("/dev/shm")
         room = shm.f_bavail * shm.f_frsize >= (UML_MEMORY_MIB + 32) << 20
@@ -143,12 +164,12 @@ def uml_memory_folder(job: str) -> str:
 
 
 def cache() -> str:
-    """What setup.sh has made."""
+    """Return the folder with the results of setup.sh."""
     return os.environ.get("VM_CACHE") or os.path.join(HERE, ".cache")
 
 
 def qemu_kernel() -> str | None:
-    """The newest kernel that setup.sh has unpacked."""
+    """Return the newest kernel that setup.sh has unpacked, or None."""
     kernels = glob.glob(os.path.join(cache(), "*", "vmlinux"))
     return max(kernels, key=os.path.getmtime, default=None)
 
@@ -164,7 +185,8 @@ def qemu_command(job: str, out: int, err: int) -> list[str]:
     initrd = os.path.join(os.path.dirname(kernel), "initrd.cpio")
     command = f"""
         qemu-system-x86_64 -nodefaults -no-user-config -display none -no-reboot
-        -machine q35 -accel tcg,thread=single,tb-size=512 -icount shift=1,sleep=off -cpu max -m {QEMU_MEMORY_MIB}
+        -machine q35 -accel tcg,thread=single,tb-size=512 -icount shift=1,sleep=off
+        -cpu max -m {QEMU_MEMORY_MIB}
         -serial file:{job}/klog -device virtio-serial-pci
         -object can-bus,id=canbus0
         -device kvaser_pci,canbus=canbus0 -device kvaser_pci,canbus=canbus0
@@ -186,7 +208,8 @@ def qemu_command(job: str, out: int, err: int) -> list[str]:
         command += ["-fsdev", f"local,id={tag},path={path},security_model=none{options}"]
         command += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
 
-    # One end is the device that the guest's driver sees, the other a virtio port that a test plays the device with.
+    # One end is the device of the guest's driver. A test simulates the device at the other end,
+    # which is a virtio port.
     command += ["-chardev", f"socket,id=com1s,path={job}/com1,server=on,wait=off"]
     command += ["-device", "isa-serial,chardev=com1s,index=1"]
     return command + port("com1", f"socket,path={job}/com1")
@@ -199,8 +222,13 @@ def under_tmpfs(folder: str) -> bool:
     return any(folder == tmpfs or folder.startswith(tmpfs + "/") for tmpfs in TMPFS)
 
 
-def write_job(job: str, backend: str, command: Sequence[str], writable: Sequence[str]) -> None:
-    """Fills the job folder: what the guest runs and which of the host's folders it mounts."""
+def write_job(
+    job: str,
+    backend: str,
+    command: Sequence[str],
+    writable: Sequence[str],
+) -> None:
+    """Fill the job folder with the guest's script and the list of the host folders to mount."""
     without = os.path.join(job, "without")
     os.mkdir(without)
     with open(os.path.join(without, "asammdf.py"), "w") as file:
@@ -221,7 +249,8 @@ def write_job(job: str, backend: str, command: Sequence[str], writable: Sequence
         "echo >/run/job/started",
         f"cd {shlex.quote(os.getcwd())} && exec {shlex.join(command)}",
     ]
-    # Where the project or Python is in a folder that the guest hides under a tmpfs, it is mounted there again.
+    # If the project or Python is in a folder that the guest hides under a tmpfs, it is mounted
+    # there again.
     needed = {
         os.getcwd(),
         PROJECT,
@@ -233,12 +262,15 @@ def write_job(job: str, backend: str, command: Sequence[str], writable: Sequence
     for name, content in (("job.sh", lines), ("ro", hidden), ("rw", writable)):
         with open(os.path.join(job, name), "w") as file:
             file.writelines(line + "\n" for line in content)
-    # A copy: the kernel's command line cannot carry a path with a blank.
+    # The script is copied, because the kernel's command line cannot contain a path with a blank.
     shutil.copy(os.path.join(HERE, "guest-init.sh"), job)
 
 
 def pump(fd: int, to: BinaryIO) -> None:
-    """Passes all that comes from the guest; goes on reading, so that the guest ends, when nobody wants it any more."""
+    """Pass on the guest's output.
+
+    Continue reading even if the output cannot be written, so that the guest can end.
+    """
     with open(fd, "rb", buffering=0) as pipe:
         while data := pipe.read(65536):
             with contextlib.suppress(OSError):
@@ -251,7 +283,10 @@ cat >/dev/null
 kill -TERM -$0 && sleep 1 && kill -KILL -$0
 rm -rf "$1"
 """
-"""A shell that outlives this process, however that ends: then what is left of the VM's processes, and its job folder, go."""
+"""A shell that survives this process, even if that is killed.
+
+It ends the VM's remaining processes and removes the job folder.
+"""
 
 
 def leave(number: int, _frame: FrameType | None) -> NoReturn:
@@ -259,12 +294,18 @@ def leave(number: int, _frame: FrameType | None) -> NoReturn:
 
 
 def start_vm(
-    backend: str, job: str, out: int, err: int, log: BinaryIO
+    backend: str,
+    job: str,
+    out: int,
+    err: int,
+    log: BinaryIO,
 ) -> "subprocess.Popen[bytes]":
     if backend == "uml":
-        command, environment = uml_command(job, out, err), uml_host_environment(job)
+        command = uml_command(job, out, err)
+        environment = uml_host_environment(job)
     else:
-        command, environment = qemu_command(job, out, err), {"TMPDIR": job}
+        command = qemu_command(job, out, err)
+        environment = {"TMPDIR": job}
     return subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -277,18 +318,28 @@ def start_vm(
 
 
 def run_in_vm(
-    backend: str, command: Sequence[str], writable: Sequence[str], timeout_s: float
+    backend: str,
+    command: Sequence[str],
+    writable: Sequence[str],
+    timeout_s: float,
 ) -> tuple[int, bool]:
-    """Returns the exit code, and whether the command was started at all."""
+    """Run a command in a VM. Return its exit code, and whether it was started at all."""
     job = tempfile.mkdtemp(prefix="vm.", dir="/var/tmp")
     undertaker = None
-    result, started = Path(job, "rc"), Path(job, "started")
+    result = Path(job, "rc")
+    started = Path(job, "started")
     try:
         write_job(job, backend, command, writable)
         pipes = [os.pipe() for _ in range(2)]
         try:
             with open(os.path.join(job, "log"), "wb") as log:
-                process = start_vm(backend, job, pipes[0][1], pipes[1][1], log)
+                process = start_vm(
+                    backend,
+                    job,
+                    pipes[0][1],
+                    pipes[1][1],
+                    log,
+                )
         finally:
             for _, end in pipes:
                 os.close(end)
@@ -332,11 +383,15 @@ def run_in_vm(
 
 
 def installed() -> list[str]:
-    """The kinds of VM that can be tried, the better one first."""
+    """Return the kinds of VM that can be tried, the better one first."""
     if not os.path.exists("/usr/bin/busybox"):
         return []
-    vms = ["uml"] if shutil.which("linux.uml") and shutil.which("cc") else []
-    return vms + (["qemu"] if qemu_kernel() and shutil.which("qemu-system-x86_64") else [])
+    vms = []
+    if shutil.which("linux.uml") and shutil.which("cc"):
+        vms.append("uml")
+    if qemu_kernel() and shutil.which("qemu-system-x86_64"):
+        vms.append("qemu")
+    return vms
 
 
 def arguments() -> argparse.Namespace:
@@ -390,7 +445,7 @@ def main() -> int:
 
 
 def run_native(command: Sequence[str], timeout_s: float) -> int:
-    """Becomes the command; `timeout` keeps the time."""
+    """Replace this process by the command. `timeout` limits its time."""
     sys.stdout.flush()
     limited = ["timeout", "--foreground", "--kill-after=10", f"{timeout_s:g}", *command]
     try:

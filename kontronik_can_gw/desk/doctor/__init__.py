@@ -1,6 +1,7 @@
-"""The checks of `doctor`: configuration, serial ports, CAN interface and service. They change nothing and send nothing.
+"""The checks of `doctor`: configuration, serial ports, CAN interface and service.
 
-A check has a name, a probe (the modules here) and a remedy for each of its results (checks.toml).
+They change nothing and send nothing. A check has a name, a probe (one of these modules), and a
+remedy for each of its results (checks.toml).
 """
 
 import tomllib
@@ -11,28 +12,30 @@ from typing import NamedTuple
 _WORDINGS: dict[str, dict[str, list[str]]] = tomllib.loads(
     Path(__file__).with_name("checks.toml").read_text(encoding="utf-8")
 )
-"""By check and case: severity, text, remedy, command; the last two may be missing."""
+"""By check and case: severity, text, remedy, command. The last two may be missing."""
 
 
 class Finding(NamedTuple):
-    """One line of the report. ``remedy`` says in words what to do, ``command`` is a line to type; either may be empty."""
+    """One line of the report."""
 
     group: str
     check: str
-    """Stable name for programs, as ``port.parity``."""
+    """Stable name for programs, for example ``port.parity``."""
     severity: str
     text: str
     remedy: str = ""
+    """Instructions for the user, or empty."""
     command: str = ""
+    """A command line to type, or empty."""
 
 
 def count(findings: Sequence[Finding], severity: str) -> int:
-    """How many have a severity."""
+    """Return the number of findings with a severity."""
     return sum(finding.severity == severity for finding in findings)
 
 
 class Findings:
-    """Collects the findings of one group. ``values``: for the wording of each of them."""
+    """Collects the findings of one group. ``values`` are inserted into the texts of all of them."""
 
     def __init__(self, group: str, **values: object) -> None:
         self.group = group
@@ -40,7 +43,8 @@ class Findings:
         self.values = values
 
     def say(self, check: str, case: str, **values: object) -> None:
-        """Add a case of a check."""
+        """Add the finding for a case of a check."""
         severity, *texts = _WORDINGS[check][case]
-        filled = [text.format(**{**self.values, **values}) for text in texts]
+        all_values = self.values | values
+        filled = [text.format(**all_values) for text in texts]
         self.found.append(Finding(self.group, check, severity, *filled))

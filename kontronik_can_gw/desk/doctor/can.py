@@ -1,4 +1,4 @@
-"""Checks the CAN interface: existence, state, bit rate, recovery from bus-off, and health of the bus."""
+"""Checks the CAN interface: existence, state, bit rate, recovery from bus-off, and bus errors."""
 
 import json
 from collections.abc import Mapping
@@ -26,7 +26,10 @@ _MODES = {"LISTEN-ONLY": "listen_only", "LOOPBACK": "loopback"}
 
 
 def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
-    """All findings about the CAN interface: the kernel's own facts, and where `ip` is there those of the controller."""
+    """Return all findings about the CAN interface.
+
+    They are based on the kernel's data, and on the controller's if the program `ip` is installed.
+    """
     findings = Findings(
         f"CAN {can.channel}",
         channel=can.channel,
@@ -41,12 +44,15 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
         findings.say("can.driver", "unseen", interface=can.interface)
         return findings.found
     if machine.text(f"{folder}/type") != _CAN_TYPE:
-        there = [n for n in machine.names(net) if machine.text(f"{net}/{n}/type") == _CAN_TYPE]
+        there = []
+        for name in machine.names(net):
+            if machine.text(f"{net}/{name}/type") == _CAN_TYPE:
+                there.append(name)
         case = "no_can"
         if not machine.exists(folder):
-            is_virtual = kind_by_name(can.channel) in VIRTUAL
-            missing = "others" if there else "none"
-            case = "no_virtual" if is_virtual else missing
+            case = "others" if there else "none"
+            if kind_by_name(can.channel) in VIRTUAL:
+                case = "no_virtual"
         findings.say("can.exists", case, there=", ".join(there) or "none")
         return findings.found
     link = _link(machine, can.channel)
@@ -55,21 +61,22 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
     findings.values["up"] = set_up(can, kind)
     findings.values["fd"] = enable_fd(can, kind)
     findings.say("can.exists", "virtual" if virtual else "ok", kind=kind)
-    is_up = bool(int(machine.text(f"{folder}/flags") or "0", 0) & 1)
+    flags = int(machine.text(f"{folder}/flags") or "0", 0)
+    is_up = bool(flags & 1)
     findings.say("can.up", "ok" if is_up else "down")
     if can.fd and int(machine.text(f"{folder}/mtu") or "0") < _FD_MTU:
         findings.say("can.fd", "off")
     if not link:
         findings.say("can.details", "no_ip")
     elif not virtual:
-        # slcan, which cannot leave bus-off by itself, has no device
+        # an slcan interface has no device, and cannot leave bus-off by itself
         has_restart = kind != "can" or machine.exists(f"{folder}/device")
         _controller(findings, can, link.get("info_data", {}), is_up, has_restart)
     return findings.found
 
 
 def _link(machine: Machine, name: str) -> Mapping[str, Any]:
-    """Kind, bit timing and state of an interface; empty without an `ip` that shows them."""
+    """Return kind, bit timing and state of an interface. Empty if `ip` does not show them."""
     shown = machine.run("ip", "-json", "-details", "link", "show", "dev", name)
     try:
         found: Mapping[str, Any] = json.loads(shown)[0].get("linkinfo", {})
@@ -81,24 +88,34 @@ def _link(machine: Machine, name: str) -> Mapping[str, Any]:
 def _controller(
     findings: Findings, can: CanConfig, data: Mapping[str, Any], is_up: bool, has_restart: bool
 ) -> None:
-    """What the driver says."""
-    # a driver with fixed rates only, as slcan, has no further timing
-    bitrate = data.get("bittiming", {}).get("bitrate", data.get("bittiming_bitrate", 0))
+    """Report bit rates, recovery from bus-off, state and modes as the driver shows them."""
+    # a driver with fixed rates, for example slcan, shows the bit rate without further timing
+    fixed_bitrate = data.get("bittiming_bitrate", 0)
+    bitrate = data.get("bittiming", {}).get("bitrate", fixed_bitrate)
     rates = {"bitrate": (can.bitrate, bitrate)}
-    if can.fd and (fast := data.get("data_bittiming", {}).get("bitrate")):
-        rates["data_bitrate"] = can.data_bitrate, fast
+    data_bitrate = data.get("data_bittiming", {}).get("bitrate")
+    if can.fd and data_bitrate:
+        rates["data_bitrate"] = (can.data_bitrate, data_bitrate)
     if is_up or bitrate:  # otherwise the command that starts it sets all of it
         for key, (wanted, real) in rates.items():
-            case = "ok" if real == wanted else "other" if real else "none"
+            case = "other" if real else "none"
+            if real == wanted:
+                case = "ok"
             findings.say("can.bitrate", case, key=key, wanted=wanted, real=real)
         ms = data.get("restart_ms", 0)
-        findings.say("can.restart", ("ok" if ms else "never") if has_restart else "slcan", ms=ms)
-    state, counters = data.get("state", "STOPPED"), data.get("berr_counter", {})
-    counts = f", error counters {counters['tx']} and {counters['rx']}" if counters else ""
+        case = "slcan"
+        if has_restart:
+            case = "ok" if ms else "never"
+        findings.say("can.restart", case, ms=ms)
+    state = data.get("state", "STOPPED")
+    counters = data.get("berr_counter", {})
+    counts = ""
+    if counters:
+        counts = f", error counters {counters['tx']} and {counters['rx']}"
     case = _STATES.get(state, "other")
     if state == "BUS-OFF":
         case = "off" if has_restart else "off_slcan"
-    if state != "STOPPED":  # it is down, as reported above
+    if state != "STOPPED":  # a stopped interface is down, which was reported above
         findings.say("can.state", case, counts=counts, state=state.lower())
     for mode in set(_MODES) & set(data.get("ctrlmode", ())):
         findings.say("can.mode", _MODES[mode])

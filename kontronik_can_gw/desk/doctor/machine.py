@@ -1,6 +1,6 @@
-"""What the checks see of the machine: files below a root, programs that only read, processes and users. Nothing is changed.
+"""The machine as the checks see it: files below a root, programs that only read, processes, users.
 
-Names are absolute paths on the machine; tests use another root.
+Nothing is changed. Names are absolute paths on the machine. Tests use another root.
 """
 
 import contextlib
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 _PATIENCE_S = 5.0
+"""Longest time that a program may take."""
 
 
 class Process(NamedTuple):
@@ -26,12 +27,14 @@ class Process(NamedTuple):
 
     @property
     def is_gateway(self) -> bool:
-        """True for a gateway of ours: `kontronik-can-gw run`, or `python -m kontronik_can_gw run`."""
+        """True for `kontronik-can-gw run` and `python -m kontronik_can_gw run`."""
         names = {word.rpartition("/")[2] for word in self.words[:4]}
-        return "run" in self.words[1:] and bool({"kontronik-can-gw", "kontronik_can_gw"} & names)
+        is_ours = not names.isdisjoint({"kontronik-can-gw", "kontronik_can_gw"})
+        return is_ours and "run" in self.words[1:]
 
     def __str__(self) -> str:
-        return f"{'kontronik-can-gw' if self.is_gateway else self.name} (pid {self.pid})"
+        name = "kontronik-can-gw" if self.is_gateway else self.name
+        return f"{name} (pid {self.pid})"
 
 
 class Machine:
@@ -44,19 +47,19 @@ class Machine:
         return self.root / name.lstrip("/")
 
     def text(self, name: str) -> str:
-        """A small file's text; empty where it cannot be read."""
+        """Return the text of a small file. Empty if it cannot be read."""
         with contextlib.suppress(OSError):
             return self.path(name).read_bytes().decode("utf-8", "replace").strip("\0\n ")
         return ""
 
     def names(self, folder: str) -> list[str]:
-        """Names in a folder; empty where it cannot be read."""
+        """Return the names in a folder. Empty if it cannot be read."""
         with contextlib.suppress(OSError):
             return sorted(each.name for each in self.path(folder).iterdir())
         return []
 
     def status(self, name: str) -> os.stat_result | None:
-        """None where there is nothing of that name that we may see."""
+        """Return the status of a file. None if it does not exist or is not visible."""
         with contextlib.suppress(OSError):
             return self.path(name).stat()
         return None
@@ -65,31 +68,46 @@ class Machine:
         return self.status(name) is not None
 
     def real(self, name: str) -> str:
-        """The path without symbolic links."""
+        """Return a path without symbolic links."""
         root = os.path.realpath(self.root)
-        return os.path.realpath(self.path(name)).removeprefix("" if root == "/" else root) or "/"
+        path = os.path.realpath(self.path(name))
+        if root != "/":
+            path = path.removeprefix(root)
+        return path or "/"
 
     def space(self, folder: str) -> tuple[bool, int]:
-        """Whether a folder's file system is read-only, and its free bytes: 0 where no more files can be made."""
+        """Return two facts about a folder's file system: if it is read-only, and its free bytes.
+
+        There are 0 free bytes if no more files can be created.
+        """
         found = os.statvfs(self.path(folder))
         is_full = found.f_files and not found.f_favail
         free = 0 if is_full else found.f_bavail * found.f_frsize
         return bool(found.f_flag & os.ST_RDONLY), free
 
     def may(self, name: str, mode: int) -> bool:
-        """True if this process may use a file or folder so (as for ``os.access``), access lists included."""
+        """Return True if this process may use a file or folder in a mode of ``os.access``.
+
+        Access lists are respected.
+        """
         return os.access(self.path(name), mode)
 
     def run(self, *command: str) -> str:
-        """Output of a program, whatever its exit code; empty where it is missing or takes too long."""
-        path = (
-            f"{os.environ.get('PATH', os.defpath)}:/usr/sbin:/sbin"  # `ip` is not on every user's
-        )
+        """Return the output of a program, regardless of its exit code.
+
+        Empty if the program is missing or takes too long.
+        """
+        path = os.environ.get("PATH", os.defpath)
+        path += ":/usr/sbin:/sbin"  # contains `ip`, and is missing in the PATH of some users
         env = os.environ | {"LC_ALL": "C", "PATH": path}
         with contextlib.suppress(OSError, subprocess.SubprocessError):
             done = subprocess.run(
-                command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PATIENCE_S, env=env
-            )  # fmt: skip
+                command,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=_PATIENCE_S,
+                env=env,
+            )
             return done.stdout.decode("utf-8", "replace")
         return ""
 
@@ -111,8 +129,10 @@ class Machine:
     def processes(self) -> list[Process]:
         """All visible processes except this one."""
         found = []
-        for pid in (int(name) for name in self.names("/proc") if name.isdigit()):
-            if pid != os.getpid() and (name := self.text(f"/proc/{pid}/comm")):
+        pids = [int(name) for name in self.names("/proc") if name.isdigit()]
+        for pid in pids:
+            name = self.text(f"/proc/{pid}/comm")
+            if pid != os.getpid() and name:
                 words = self.text(f"/proc/{pid}/cmdline").split("\0")
                 found.append(Process(pid, name, tuple(words)))
         return found
@@ -122,9 +142,13 @@ class Machine:
         return any(process.is_gateway for process in self.processes)
 
     def openers(self, device: os.stat_result) -> Iterator[Process]:
-        """Processes that have a character device open, as far as this user may see."""
+        """Yield the processes that have a character device open and are visible to this user."""
         for process in self.processes:
             folder = f"/proc/{process.pid}/fd"
-            held = (self.status(f"{folder}/{number}") for number in self.names(folder))
-            if any(s and stat.S_ISCHR(s.st_mode) and s.st_rdev == device.st_rdev for s in held):
+            files = (self.status(f"{folder}/{number}") for number in self.names(folder))
+            if any(_is_device(file, device) for file in files):
                 yield process
+
+
+def _is_device(file: os.stat_result | None, device: os.stat_result) -> bool:
+    return file is not None and stat.S_ISCHR(file.st_mode) and file.st_rdev == device.st_rdev

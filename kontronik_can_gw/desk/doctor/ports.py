@@ -1,6 +1,6 @@
-"""Checks the serial port of one ESC: existence, permission, other programs that use it or write to it.
+"""Checks the serial port of one ESC: existence, permission, and other programs that use it.
 
-No port is opened: whether it takes the ESC's line settings is known once the gateway runs.
+No port is opened. So only a running gateway shows if the port accepts the ESC's line settings.
 """
 
 import os
@@ -14,26 +14,33 @@ from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.ports.serial_port import is_mini_uart
 
 _RULES = "udev/rules.d/70-kontronik-can-gw.rules"
-"""Keeps ModemManager away."""
+"""These rules prevent ModemManager from using the ports."""
 
 
 def diagnoses(document: Mapping[str, Any] | None) -> dict[str, str]:
-    """Why the ESCs of a running gateway are not heard, by name, from its status document."""
+    """Return the reasons for missing telemetry, by ESC, from a gateway's status document."""
     escs = [] if document is None else document["escs"]
-    return {esc["name"]: printable(str(esc["diagnosis"])) for esc in escs if esc["diagnosis"]}
+    found = {}
+    for esc in escs:
+        if esc["diagnosis"]:
+            found[esc["name"]] = printable(str(esc["diagnosis"]))
+    return found
 
 
 def check_port(
     machine: Machine, esc: str, port: str, even_parity: bool, diagnosis: str = ""
 ) -> list[Finding]:
-    """Returns all findings about the port of one ESC.
+    """Return all findings about the port of one ESC.
 
-    ``even_parity``: its line needs that. ``diagnosis``: why the gateway that runs does not hear it.
+    ``even_parity`` is True if the ESC needs even parity. ``diagnosis`` is the reason why a running
+    gateway receives no telemetry from it.
     """
-    real, status = machine.real(port), machine.status(port)
+    real = machine.real(port)
+    status = machine.status(port)
     tty = real.rpartition("/")[2]
     findings = Findings(f"Serial port of {esc}", port=port, tty=tty, user=machine.user)
-    hardware, is_pty = f"/sys/class/tty/{tty}", real.startswith("/dev/pts/")
+    hardware = f"/sys/class/tty/{tty}"
+    is_pty = real.startswith("/dev/pts/")
     is_tty = status is not None and stat.S_ISCHR(status.st_mode)
     if status is None or not is_tty or not (is_pty or machine.exists(hardware)):
         named = ", ".join(machine.names("/dev/serial/by-id"))
@@ -46,10 +53,7 @@ def check_port(
     findings.say("port.exists", "pty" if is_pty else "ok", what=what)
     if diagnosis:
         findings.say("port.telemetry", "none", diagnosis=diagnosis)
-    case = "ok"
-    if not machine.may(port, os.R_OK | os.W_OK):
-        is_shared = status.st_mode & 0o060 == 0o060 and status.st_gid != 0
-        case = "gateway" if machine.runs_gateway else "join" if is_shared else "open"
+    case = _permission(machine, port, status)
     findings.say("port.permission", case, group=machine.group_name(status.st_gid))
     _users(machine, findings, status, is_pty)
     if is_pty:
@@ -63,26 +67,53 @@ def check_port(
     return findings.found
 
 
+def _permission(machine: Machine, port: str, status: os.stat_result) -> str:
+    """Return the case of the check ``port.permission``."""
+    if machine.may(port, os.R_OK | os.W_OK):
+        return "ok"
+    if machine.runs_gateway:
+        return "gateway"
+    has_group_access = status.st_mode & 0o060 == 0o060
+    return "join" if has_group_access and status.st_gid != 0 else "open"
+
+
 def _adapter(machine: Machine, folder: str) -> str:
-    """The folder of the USB adapter that a tty belongs to; empty for others."""
+    """Return the folder of a tty's USB adapter. Empty if the tty is not a USB adapter."""
     while folder.count("/") > 2 and not machine.exists(f"{folder}/idVendor"):
         folder = folder.rpartition("/")[0]
     return folder if folder.count("/") > 2 else ""
 
 
 def _stable_name(machine: Machine, real: str, usb: str) -> str:
-    """A name by the adapter's serial number if it has one, else by the USB socket."""
-    kinds = ("by-id", "by-path") if machine.text(f"{usb}/serial") else ("by-path", "by-id")
-    folders = [f"/dev/serial/{kind}" for kind in kinds]
-    names = [f"{folder}/{name}" for folder in folders for name in machine.names(folder)]
-    return next((name for name in names if machine.real(name) == real), "")
+    """Return a stable name of a port. Empty if there is none.
+
+    It contains the adapter's serial number if it has one, and otherwise the USB socket.
+    """
+    kinds = ["by-id", "by-path"]
+    if not machine.text(f"{usb}/serial"):
+        kinds.reverse()
+    for kind in kinds:
+        folder = f"/dev/serial/{kind}"
+        for name in machine.names(folder):
+            if machine.real(f"{folder}/{name}") == real:
+                return f"{folder}/{name}"
+    return ""
 
 
 def _users(machine: Machine, findings: Findings, status: os.stat_result, is_pty: bool) -> None:
-    """Report who has the port open; of a pseudo terminal the simulator has it, too. A getty is reported below."""
-    holders = [each for each in machine.openers(status) if "getty" not in each.name]
-    own = [each for each in holders if each.is_gateway]
-    others = [] if is_pty else [each for each in holders if not each.is_gateway]
+    """Report the programs that have the port open.
+
+    The simulator has a pseudo terminal open, too. A getty is reported by another check.
+    """
+    own = []
+    others = []
+    for process in machine.openers(status):
+        if "getty" in process.name:
+            continue
+        if process.is_gateway:
+            own.append(process)
+        elif not is_pty:
+            others.append(process)
     for process in own:
         findings.say("port.users", "gateway", who=process)
     if others:
@@ -96,16 +127,17 @@ def _writers(machine: Machine, findings: Findings, tty: str, usb: str) -> None:
     """Check that no console of the kernel, no login prompt and no service writes to the ESC."""
     is_console = tty in machine.text("/sys/class/tty/console/active").split()
     findings.say("port.console", "console" if is_console else "ok")
-    prompts = [
-        str(process)
-        for process in machine.processes
-        if "getty" in process.name and tty in [w.rpartition("/")[2] for w in process.words[1:]]
-    ]
+    prompts = []
+    for process in machine.processes:
+        arguments = [word.rpartition("/")[2] for word in process.words[1:]]
+        if "getty" in process.name and tty in arguments:
+            prompts.append(str(process))
     findings.say("port.getty", "getty" if prompts else "ok", who=", ".join(prompts))
-    names = {process.name for process in machine.processes} if usb else set()
-    if "ModemManager" in names and not any(
-        machine.exists(f"{top}/{_RULES}") for top in ("/etc", "/usr/lib", "/lib")
-    ):
+    if not usb:
+        return
+    names = {process.name for process in machine.processes}
+    has_rules = any(machine.exists(f"{top}/{_RULES}") for top in ("/etc", "/usr/lib", "/lib"))
+    if "ModemManager" in names and not has_rules:
         findings.say("port.modem_manager", "runs")
     if "brltty" in names:
         findings.say("port.brltty", "runs")

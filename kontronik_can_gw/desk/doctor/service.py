@@ -1,4 +1,4 @@
-"""Checks the installed systemd service: the unit that runs a configuration and its state; and folders that are written."""
+"""Checks the systemd service that runs a configuration, and the folders to which it writes."""
 
 import os
 from pathlib import PurePath
@@ -17,23 +17,28 @@ _UNIT_FOLDERS = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd
 
 
 class Unit(NamedTuple):
-    """A systemd unit, and its properties as `systemctl show` has them."""
+    """A systemd unit with its properties from `systemctl show`."""
 
     name: str
     shown: dict[str, str]
 
     @property
     def state_folder(self) -> str:
-        """Default folder of its stored parameters."""
-        return f"/var/lib/{self.name.removesuffix('.service').replace('@', '-')}"
+        """Default folder of the stored parameters."""
+        name = self.name.removesuffix(".service").replace("@", "-")
+        return f"/var/lib/{name}"
 
 
 def unit_of(machine: Machine, config: str) -> Unit | None:
-    """The unit for a configuration file, by its absolute path; None where systemd has none."""
+    """Return the unit of a configuration file with this absolute path. None if there is none."""
     name = _unit_name(config)
-    lines = machine.run("systemctl", "show", name, f"--property={_SHOWN}").splitlines()
-    shown = dict(line.partition("=")[::2] for line in lines)
-    return Unit(name, shown) if shown.get("LoadState") == "loaded" else None
+    shown = {}
+    for line in machine.run("systemctl", "show", name, f"--property={_SHOWN}").splitlines():
+        key, _, value = line.partition("=")
+        shown[key] = value
+    if shown.get("LoadState") != "loaded":
+        return None
+    return Unit(name, shown)
 
 
 def _unit_name(config: str) -> str:
@@ -43,7 +48,7 @@ def _unit_name(config: str) -> str:
 
 
 def check_service(machine: Machine, findings: Findings, unit: Unit | None, config: str) -> None:
-    """Check whether it is installed, enabled and running, and how often it was restarted."""
+    """Check if the service is installed, enabled and running, and how often it was restarted."""
     if unit is None:
         name = _unit_name(config)
         if not machine.exists(_BOOTED):
@@ -60,7 +65,8 @@ def check_service(machine: Machine, findings: Findings, unit: Unit | None, confi
             findings.say("machine.service", "none")
         return
     state = unit.shown.get("ActiveState", "")
-    restarts, result = unit.shown.get("NRestarts", "0"), unit.shown.get("Result", "")
+    restarts = unit.shown.get("NRestarts", "0")
+    result = unit.shown.get("Result", "")
     case = "ok" if restarts == "0" else "restarted"
     if state not in ("active", "reloading"):
         case = "failed" if state == "failed" else "stopped"
@@ -78,8 +84,8 @@ def check_folder(
 ) -> None:
     """Check that a folder exists or can be created, is writable and has free space.
 
-    ``what``: its use, as "stored parameters". ``own``: systemd makes it for the service. ``reserve``: with fewer bytes free nothing is
-    written there.
+    ``what``: the use of the folder, for example "stored parameters". ``own``: systemd creates it
+    for the service. ``reserve``: number of free bytes below which nothing is written to it.
     """
     there = PurePath(folder)
     while (status := machine.status(str(there))) is None:

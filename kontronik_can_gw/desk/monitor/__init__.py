@@ -1,1 +1,1 @@
-"""The screens of monitor, demo and status: one model, one table, one terminal."""
+"""The terminal screens of monitor, demo and status."""

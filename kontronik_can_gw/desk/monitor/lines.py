@@ -1,4 +1,4 @@
-"""Lines of text for a terminal, made printable: words, numbers, tables. Pure."""
+"""Makes printable lines of text for a terminal: words, numbers and tables. Pure."""
 
 import re
 import textwrap
@@ -16,7 +16,7 @@ STATES = {
     "unknown": "",
     "-": "dim",
 }
-"""Styles of states of a link, a CAN controller and a gateway; any other is bad."""
+"""Styles of the states of a link, a CAN controller and a gateway. Other states are bad."""
 _KINDS = {Severity.ERROR: ("ERROR", "bold red"), Severity.WARNING: ("WARNING", "yellow")}
 
 Part = str | tuple[str, str] | Text
@@ -24,19 +24,21 @@ Part = str | tuple[str, str] | Text
 
 
 def line(*parts: Part) -> Text:
-    """A line that is cut, not wrapped, where it is too long."""
+    """Return a line that is cut, not wrapped, if it is too long."""
     made = Text(no_wrap=True, overflow="ellipsis", end="")
     for part in parts:
         if isinstance(part, Text):
             made.append_text(part)
+        elif isinstance(part, str):
+            made.append(printable(part), "")
         else:
-            text, style = (part, "") if isinstance(part, str) else part
+            text, style = part
             made.append(printable(text), style)
     return made
 
 
 def wrapped(text: str, style: str, width: int) -> list[Text]:
-    """The text as lines of this width."""
+    """Return a text as lines of this width."""
     parts = textwrap.wrap(text, max(20, width), subsequent_indent="    ", break_on_hyphens=False)
     return [line((part, style)) for part in parts]
 
@@ -44,25 +46,28 @@ def wrapped(text: str, style: str, width: int) -> list[Text]:
 def table(
     rows: Sequence[Sequence[Part]], width: int, left: int, least: Sequence[int]
 ) -> list[Text]:
-    """Lines of aligned columns; those that do not fit are left out from the right.
+    """Return lines of aligned columns. Columns that do not fit are left out from the right.
 
-    ``left``: number of left-aligned columns. ``least``: their minimum widths, so that a live table does not jump.
+    ``left``: number of left-aligned columns. ``least``: the minimum width of each column, so that
+    the columns of a live table keep their positions.
     """
     cells = [[line(part) for part in row] for row in rows]
-    widths = [
-        max(wide, *(cell.cell_len for cell in column))
-        for wide, column in zip(least, zip(*cells, strict=True), strict=True)
-    ]
+    widths = []
+    for minimum, column in zip(least, zip(*cells, strict=True), strict=True):
+        widths.append(max(minimum, *(cell.cell_len for cell in column)))
     while sum(widths) + len(widths) - 1 > width and len(widths) > 1:
         widths.pop()
+    lines = []
     for row in cells:
-        for number, (cell, wide) in enumerate(zip(row, widths, strict=False)):
-            cell.align("left" if number < left else "right", wide)
-    return [line(Text(" ").join(row[: len(widths)])) for row in cells]
+        shown = row[: len(widths)]
+        for index, cell in enumerate(shown):
+            cell.align("left" if index < left else "right", widths[index])
+        lines.append(line(Text(" ").join(shown)))
+    return lines
 
 
 def alarm_lines(alarms: Iterable[tuple[str, Alarm]], width: int, room: int = 999) -> list[Text]:
-    """Errors and warnings, each after a name, with remedies where there is room."""
+    """Return errors and warnings, each after a name. Remedies are added if there is room."""
     lines: list[Text] = []
     for with_remedy in (True, False):
         lines = []
@@ -77,23 +82,32 @@ def alarm_lines(alarms: Iterable[tuple[str, Alarm]], width: int, room: int = 999
 
 
 def cut(lines: list[Text], room: int) -> list[Text]:
-    """The lines that fit; the last one counts those left out."""
+    """Return the lines that fit into ``room``. The last line has the number of omitted lines."""
     if len(lines) <= room:
         return lines
+    if room <= 0:
+        return []
     more = line((f"... and {len(lines) - room + 1} lines more: enlarge the terminal", "dim"))
-    return [*lines[: max(0, room - 1)], more][: max(0, room)]
+    return [*lines[: room - 1], more]
 
 
 def words(text: str) -> str:
-    """A name as people write it: ``SpoolUpFromStill`` -> ``spool up from still``, ``RpmControl`` -> ``RPM control``."""
-    parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W_]", text)
-    return " ".join(
-        part if len(part) > 1 and part.isupper() else part.lower() for part in parts
-    ).replace("rpm", "RPM")
+    """Return a name as separate words.
+
+    ``SpoolUpFromStill`` becomes ``spool up from still``, ``RpmControl`` becomes ``RPM control``.
+    """
+    parts = []
+    for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W_]", text):
+        is_acronym = len(part) > 1 and part.isupper()
+        parts.append(part if is_acronym else part.lower())
+    return " ".join(parts).replace("rpm", "RPM")
 
 
 def shorten(name: str, width: int) -> str:
-    """A name of at most ``width`` characters: without its middle, because names often differ at an end."""
+    """Return a name of at most ``width`` characters.
+
+    The middle of a longer name is left out, because names often differ at an end.
+    """
     if len(name) <= width:
         return name
     tail = max(0, (width - 1) // 2)
@@ -102,5 +116,7 @@ def shorten(name: str, width: int) -> str:
 
 
 def number(value: float | None, digits: int = 0) -> str:
-    """A formatted value in groups of three digits; a dash where it is not available."""
-    return "-" if value is None else f"{value:,.{digits}f}".replace(",", " ")
+    """Return a value in groups of three digits. A dash means not available."""
+    if value is None:
+        return "-"
+    return f"{value:,.{digits}f}".replace(",", " ")

@@ -1,4 +1,7 @@
-"""The model of the live screen: the ESCs and the gateway as their frames show them, with extremes and a short history. Pure."""
+"""The model of the live screen: values of gateway and ESCs, extremes and a short history.
+
+All values are read from CAN frames. Pure: no I/O, no clock.
+"""
 
 from collections import deque
 from typing import Any, NamedTuple
@@ -15,19 +18,19 @@ from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND
 
 HISTORY_S = 60
-"""Length of a history, one value each second."""
+"""Length of a history, which has one value for each second."""
 SILENCE_NS = 5 * SECOND
 """After this time without a frame the screen shows possible causes."""
 
 
 class Quantity(NamedTuple):
-    """A measured value by its source. Limits are lower ones if ``alarm`` is below ``warning``."""
+    """A measured value. Its limits are lower limits if ``alarm`` is below ``warning``."""
 
     source: str
     label: str
     digits: int
     head: str = ""
-    """Head of its column in the table of all ESCs; empty: only on an ESC's own page."""
+    """Head of its column in the table of all ESCs. Empty: shown only on an ESC's own page."""
     warning: float | None = None
     alarm: float | None = None
 
@@ -36,15 +39,20 @@ class Quantity(NamedTuple):
         return VALUES[self.source].unit
 
     def mark(self, value: float) -> str:
-        """``!!`` or ``!`` for a value beyond its limit for an alarm or a warning."""
+        """Return ``!!`` for a value beyond its alarm limit, ``!`` beyond its warning limit."""
         if self.warning is None or self.alarm is None:
             return ""
         sign = 1 if self.alarm >= self.warning else -1
-        return "!" * ((sign * value >= sign * self.warning) + (sign * value >= sign * self.alarm))
+        if sign * value >= sign * self.alarm:
+            return "!!"
+        if sign * value >= sign * self.warning:
+            return "!"
+        return ""
 
 
-# The most important first: what does not fit on the screen is left out from the end.
-# The ESC does not report its limits. A lithium polymer cell is nearly empty below 3.5 V under load, and damaged below 3.3 V.
+# The most important quantities are first. The last ones are left out if the screen is too small.
+# The ESC does not report its limits. A lithium polymer cell is nearly empty below 3.5 V under load,
+# and damaged below 3.3 V.
 QUANTITIES = (
     Quantity("motor_speed", "motor speed", 0, "1/min"),
     Quantity("battery_voltage", "battery voltage", 2, "V"),
@@ -67,7 +75,10 @@ QUANTITIES = (
 
 
 class Track:
-    """Minimum, maximum and history of a value; the history has None for seconds in which it was not available."""
+    """Minimum, maximum and history of a value.
+
+    The history has None for each second in which the value was not available.
+    """
 
     def __init__(self) -> None:
         self.low: float | None = None
@@ -82,32 +93,43 @@ class Track:
 
 
 class Esc(Member):
-    """One ESC as seen on the bus. All values are those of the last ``Monitor.advance``."""
+    """One ESC as seen on the bus. Its values are updated by ``Monitor.advance``."""
 
     tracks: dict[str, Track]
 
     @property
     def device_text(self) -> str:
-        """Device, variant and firmware; empty where not available."""
+        """Device, variant and firmware. Empty if they are not available."""
+        if not self.device:
+            return ""
+        text = self.device
         variant = self.number("variant")
-        text = self.device or ""
-        if text and variant is not None:
+        if variant is not None:
             text += f" {variant:.0f}"
-        return f"{text}, firmware {self.firmware}" if text and self.firmware else text
+        if self.firmware:
+            text += f", firmware {self.firmware}"
+        return text
 
     @property
     def active(self) -> list[Alarm]:
-        """The bits that are set."""
-        return [flag for word in self.protocol.errors for flag in self.flags(word) or ()]
+        """The error bits that are set."""
+        found: list[Alarm] = []
+        for word in self.protocol.errors:
+            found += self.flags(word) or ()
+        return found
 
     @property
     def units(self) -> dict[str, str]:
-        """Unit of each source in the DBC, in the order of the sources, except flags and words of flags."""
+        """Unit of each source in the DBC, except flags and error words."""
         words = self.protocol.errors
-        return {n: v.unit for n, v in VALUES.items() if n in self.no_flags and n not in words}
+        return {
+            name: value.unit
+            for name, value in VALUES.items()
+            if name in self.no_flags and name not in words
+        }
 
     def document(self) -> dict[str, Any]:
-        """Everything as JSON; None for what is not available."""
+        """Return all data as JSON. Values that are not available are None."""
         names: dict[Severity, list[str]] = {severity: [] for severity in Severity}
         for flag in self.active:
             names[flag.severity].append(flag.text)
@@ -124,7 +146,7 @@ class Esc(Member):
 
 
 class Monitor:
-    """The ESCs and the gateway of a layout. ``now``: nanoseconds on the clock of the frames."""
+    """The gateway and the ESCs of a layout. Times are in ns on the clock of the frames."""
 
     def __init__(self, bus: BusLayout) -> None:
         self.file = bus.layout.file.rpartition("/")[2]
@@ -133,27 +155,31 @@ class Monitor:
         self.gateway = Member(self.view, None, None)
         self.escs = tuple(Esc(self.view, each, index) for index, each in enumerate(bus.escs))
         self.frame_rate: float | None = None
-        """Frames of the layout in the last second; None during the first one."""
+        """Frames of the layout in the last second. None during the first second."""
         self._start: int | None = None
         self._now = -LATEST_NS
-        """Times before the trigger of a log are negative."""
-        self._second = (0, 0)
-        """Begin of the present second, and the number of frames then."""
+        """The present time. Times before the trigger of a log are negative."""
+        self._second_ns = 0
+        """Begin of the present second."""
+        self._second_frames = 0
+        """Number of frames at the begin of the present second."""
         parts = self.view.reader.parts
         cyclic = {part.first for part in parts if part.plan.cycle_ns}
         self._missing = cyclic or {part.first for part in parts}
+        """First columns of the messages that were not received yet."""
         self.reset()
 
     @property
     def is_complete(self) -> bool:
-        """True once every cyclic message has come."""
+        """True after each cyclic message was received."""
         return not self._missing
 
     def take(self, frame: CanFrame, now: int) -> None:
-        """Take a frame that came at ``now``; frames outside the layout are ignored."""
+        """Evaluate a frame that was received at ``now``, if it is in the layout."""
         if frame.remote:
             return
-        for first, values in self.view.take(frame.key, frame.data, self.advance(now)) or ():
+        now = self.advance(now)
+        for first, values in self.view.take(frame.key, frame.data, now) or ():
             self._missing.discard(first)
             for column, raw in enumerate(values, first):
                 if column in self._tracked:
@@ -163,44 +189,58 @@ class Monitor:
                         esc.tracks[source].take(value)
 
     def advance(self, now: int) -> int:
-        """Advance the time: values of missing messages become not available. Return the time, which never goes back."""
-        self._now = now = max(now, self._now)
+        """Set the time and expire the values of missing messages.
+
+        Returns the time, which never decreases.
+        """
+        now = max(now, self._now)
+        self._now = now
+        frames = self.view.frames
         if self._start is None:
-            self._start, self._second = now, (now, self.view.frames)
+            self._start = now
+            self._second_ns = now
+            self._second_frames = frames
         self.view.expire(now)
-        begin, frames = self._second
-        if seconds := (now - begin) // SECOND:
-            self.frame_rate = (self.view.frames - frames) * SECOND / (now - begin)
-            self._second = (begin + seconds * SECOND, self.view.frames)
+        elapsed_ns = now - self._second_ns
+        seconds = elapsed_ns // SECOND
+        if seconds:
+            self.frame_rate = (frames - self._second_frames) * SECOND / elapsed_ns
+            self._second_ns += seconds * SECOND
+            self._second_frames = frames
+            repeats = min(seconds, HISTORY_S)
             for esc in self.escs:
                 for source, track in esc.tracks.items():
-                    track.history.extend([esc.number(source)] * min(seconds, HISTORY_S))
+                    track.history.extend([esc.number(source)] * repeats)
         return now
 
     def reset(self) -> None:
         """Restart extremes and history."""
+        self._tracked: dict[int, tuple[Esc, str]] = {}
+        """ESC and source of each column that has a track."""
         for esc in self.escs:
             esc.tracks = {quantity.source: Track() for quantity in QUANTITIES}
-        self._tracked = {
-            esc.columns[source]: (esc, source)
-            for esc in self.escs
-            for source in esc.tracks
-            if esc.has(source)
-        }
+            for source in esc.tracks:
+                if esc.has(source):
+                    self._tracked[esc.columns[source]] = (esc, source)
 
     @property
     def silent_ns(self) -> int:
-        """Time since the last frame, or since the start before the first one."""
-        last = self.view.last_ns if self.view.last_ns is not None else self._start
-        return 0 if last is None else max(0, self._now - last)
+        """Time since the last frame. Before the first frame, the time since the start."""
+        last_ns = self.view.last_ns
+        if last_ns is None:
+            last_ns = self._start
+        return 0 if last_ns is None else max(0, self._now - last_ns)
 
     @property
     def is_replay(self) -> bool:
-        """True where the gateway reports that it plays a recording."""
+        """True if the gateway reports that it plays a recording."""
         return normalize(self.gateway.text("gateway_state") or "") == "replay"
 
     def document(self) -> dict[str, Any]:
-        """Everything as JSON: source names, values and their units; None for what is not available."""
+        """Return all data as JSON: sources, values and units. None means not available."""
+        units: dict[str, str] = {}
+        for esc in self.escs:
+            units |= {name: unit for name, unit in esc.units.items() if unit}
         return {
             "frames": self.view.frames,
             "gateway": {
@@ -208,6 +248,6 @@ class Monitor:
                 "can_state": self.gateway.text("can_state"),
                 "uptime_s": self.gateway.number("uptime"),
             },
-            "units": {name: unit for esc in self.escs for name, unit in esc.units.items() if unit},
+            "units": units,
             "escs": [esc.document() for esc in self.escs],
         }

@@ -1,4 +1,7 @@
-"""The state of a running gateway from its statistics file: an exit code, faults in words, lines of at most 80 columns."""
+"""Evaluates the status file of a running gateway.
+
+The results are an exit code, texts about faults, and lines of at most 80 columns.
+"""
 
 import json
 import os
@@ -31,13 +34,27 @@ from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.runtime.system.fault_log import duration
 from kontronik_can_gw.times import MS, SECOND
 
-HEALTHY, TROUBLE, NOT_RUNNING = 0, 1, 3
+HEALTHY = 0
+TROUBLE = 1
+NOT_RUNNING = 3
 _LARGEST_FILE = 1 << 22
 FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
 MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
-"""What a document with values of another type raises."""
+"""Exceptions caused by a document whose values have unexpected types."""
 _WIDTH = 80
-_WIDTHS = {"ESC": 3, "link": 10, "Hz": 3, "age": 6, "V": 5, "A": 6, "1/min": 6, "°C": 3, "CRC": 5, "line": 4, "lost": 4}  # fmt: skip
+_WIDTHS = {
+    "ESC": 3,
+    "link": 10,
+    "Hz": 3,
+    "age": 6,
+    "V": 5,
+    "A": 6,
+    "1/min": 6,
+    "°C": 3,
+    "CRC": 5,
+    "line": 4,
+    "lost": 4,
+}
 """Heads and widths of the table's columns."""
 
 Document = Mapping[str, Any]
@@ -54,9 +71,9 @@ class Seen:
     age_s: float | None = None
     document: Document | None = None
     is_missing: bool = False
-    """There is no such file."""
+    """True if the file does not exist."""
     is_service: bool = False
-    """systemd started the gateway, so its log is in the journal."""
+    """True if systemd started the gateway, so that its log is in the journal."""
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -82,13 +99,15 @@ def _service_files() -> list[Path]:
 
 
 def possible_files(config: Path | None) -> list[Path]:
-    """Return the files that may hold the status of a configuration's gateway: run by hand, or as a service.
+    """Return the files that may contain the status of a configuration's gateway.
 
-    Without a configuration this is the file of the plain service.
+    The gateway may run as a service or may have been started by hand. Without a configuration, the
+    file of the plain service is returned.
     """
     service = PROGRAM
     if config is not None:
-        if (configured := load(config).statistics_path) is not None:
+        configured = load(config).statistics_path
+        if configured is not None:
             return [configured]
         if config.stem != "gateway":
             service = f"{PROGRAM}-{config.stem}"
@@ -99,28 +118,33 @@ def possible_files(config: Path | None) -> list[Path]:
 
 
 def look_at_first(files: Sequence[Path], now: int, config: Path | None = None) -> Seen:
-    """Return the result of the file that shows a running gateway, else of one that shows why there is none.
+    """Return the result of the first file of a running gateway.
 
-    ``config`` is the configuration that the gateway must have.
+    If no gateway runs, the result that best shows the reason is returned. ``config`` is the
+    configuration that the gateway must have.
     """
-    seen = [look_at(file, now, config) for file in files]
-    return min(seen, key=lambda each: (each.document is None, each.code, each.is_missing))
+
+    def rank(seen: Seen) -> tuple[bool, int, bool]:
+        return seen.document is None, seen.code, seen.is_missing
+
+    return min([look_at(file, now, config) for file in files], key=rank)
 
 
 def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
     """Return the result of a status file at ``now`` (monotonic).
 
-    ``config`` is the configuration of the gateway that is meant; the file may be another gateway's.
+    ``config`` is the configuration of the expected gateway. The file may be another gateway's.
     """
     try:
-        # a pipe would block, and may take the place of the file at any time
+        # the file may be replaced by a pipe at any time, on which a normal open would block
         with open(file, "rb", opener=_open_without_waiting) as opened:
             if not stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
                 text = "is no plain file. Look at statistics.file."
                 return Seen(file, NOT_RUNNING, f"{file}: {text}")
             document = json.loads(opened.read(_LARGEST_FILE))
     except FileNotFoundError:
-        text = f"{file}: not running: there is no such file. Start the gateway whose statistics.file it is."
+        text = f"{file}: not running: there is no such file. "
+        text += "Start the gateway whose statistics.file it is."
         if config is not None:
             start = f"Start it: kontronik-can-gw run -c {config}"
             text = f"{config}: no gateway runs with this configuration. {start}"
@@ -149,7 +173,7 @@ def _open_without_waiting(path: str, flags: int) -> int:
 
 
 def judge(file: Path, document: Any, now: int) -> Seen:
-    """The exit code for a document, with the faults in words."""
+    """Return the result of a document: the exit code and the texts about faults."""
     try:
         if document["program"] != PROGRAM:
             return Seen(file, NOT_RUNNING, f"{file}: {FOREIGN}")
@@ -157,7 +181,7 @@ def judge(file: Path, document: Any, now: int) -> Seen:
             text = f"is of another version of {PROGRAM} ({document['version']})."
             return Seen(file, NOT_RUNNING, f"{file}: {text}")
         seen = _judge(file, document, now)
-        list(lines_of(seen))  # whatever cannot be shown is no document of ours
+        list(lines_of(seen))  # a document that cannot be shown is foreign
     except MALFORMED:
         return Seen(file, NOT_RUNNING, f"{file}: {FOREIGN}")
     return seen
@@ -167,15 +191,16 @@ def _judge(file: Path, document: Document, now: int) -> Seen:
     age = now - document["monotonic_ns"]
     age_s = age / SECOND
     if abs(age) > STALE_NS:
-        text = "not running"  # the machine has restarted since
+        text = "not running"  # a time in the future: the machine was restarted
         if age > 0:
             text = f"has written nothing for {duration(age)} (ended, held up, or the disk is full)"
         return Seen(file, NOT_RUNNING, text, (), age_s, document)
     troubles = tuple(map(printable, _troubles(document)))
     sentence = printable(document["gateway"]["state"])
-    if troubles:
-        sentence += f", {len(troubles)} fault{'s' if len(troubles) > 1 else ''}"
-    return Seen(file, TROUBLE if troubles else HEALTHY, sentence, troubles, age_s, document)
+    if not troubles:
+        return Seen(file, HEALTHY, sentence, (), age_s, document)
+    count = "1 fault" if len(troubles) == 1 else f"{len(troubles)} faults"
+    return Seen(file, TROUBLE, f"{sentence}, {count}", troubles, age_s, document)
 
 
 def _troubles(document: Document) -> Iterator[str]:
@@ -188,7 +213,8 @@ def _troubles(document: Document) -> Iterator[str]:
     elif can["stalled"]:
         yield can["complaint"] or f"{channel}: no frame can be sent"
     for esc in document["escs"]:
-        port, reason = esc["port"], esc["diagnosis"]
+        port = esc["port"]
+        reason = esc["diagnosis"]
         if not port["open"]:
             lost = port["lost_for_s"]
             since = "" if lost is None else f" for {duration(round(lost * SECOND))}"
@@ -196,9 +222,11 @@ def _troubles(document: Document) -> Iterator[str]:
             reason = f"port not open{since}: {complaint or port['path']}"
         if not esc["fresh"]:
             yield f"{esc['name']}: {reason or 'no telemetry'}"
-    if (store := document["store"]) and store["last_error"]:
+    store = document["store"]
+    if store and store["last_error"]:
         yield f"parameters cannot be stored: {store['last_error']}"
-    if (recording := document["recording"]) and recording["problem"]:
+    recording = document["recording"]
+    if recording and recording["problem"]:
         yield f"captures: {recording['problem']}"
 
 
@@ -206,7 +234,7 @@ def _troubles(document: Document) -> Iterator[str]:
 
 
 def lines_of(seen: Seen) -> Iterator[Text]:
-    """Everything about one gateway, most important first."""
+    """Yield all lines about one gateway, the most important first."""
     document = seen.document
     if document is None:
         yield from wrapped(seen.sentence, "bold red", _WIDTH)
@@ -220,7 +248,8 @@ def lines_of(seen: Seen) -> Iterator[Text]:
         yield from _head(seen, document)
         yield from _can_lines(document)
         yield line()
-        yield from table(list(_esc_rows(document)), _WIDTH, 2, tuple(_WIDTHS.values()))
+        rows = list(_esc_rows(document))
+        yield from table(rows, _WIDTH, 2, tuple(_WIDTHS.values()))
         for trouble in seen.troubles:
             yield from wrapped(trouble, "bold red", _WIDTH)
         yield from alarm_lines(alarms(document), _WIDTH)
@@ -232,43 +261,57 @@ def lines_of(seen: Seen) -> Iterator[Text]:
 
 
 def _head(seen: Seen, document: Document) -> Iterator[Text]:
-    process, gateway = document["process"], document["gateway"]
-    state = seen.sentence, "bold green" if seen.code == HEALTHY else "bold yellow"
+    process = document["process"]
+    gateway = document["gateway"]
+    style = "bold green" if seen.code == HEALTHY else "bold yellow"
+    state = (seen.sentence, style)
     up = duration(round(process["uptime_s"] * SECOND))
     escs = f"{gateway['escs_ok']} of {gateway['esc_count']} ESCs heard, up {up}"
     yield line(f"{PROGRAM} {document['version']}  ", state, f"  {escs}")
     memory = f"{process['rss_bytes'] // 1_000_000} MB"
     yield line((f"process {process['pid']}, {memory}, {document['configuration']}", "dim"))
-    if "core" in gateway:  # 0.5.0 had but one
+    if "core" in gateway:  # documents of 0.5.0 do not have it
         layout = f", layout {gateway['layout']}" if gateway.get("layout") else ""
-        yield line((f"{in_words(gateway['core'], gateway['core_reason'])}{layout}", "dim"))
+        core = in_words(gateway["core"], gateway["core_reason"])
+        yield line((f"{core}{layout}", "dim"))
 
 
 def _can_lines(document: Document) -> Iterator[Text]:
-    can, rates = document["can"], document.get("rates") or {}
-    text = "" if not can["bitrate"] else f", {can['bitrate'] / 1000:g} kbit/s"
+    can = document["can"]
+    rates = document.get("rates") or {}
+    text = ""
+    if can["bitrate"]:
+        text = f", {can['bitrate'] / 1000:g} kbit/s"
     for name in ("sent", "received"):
         text += f", {name} {number(rates.get(f'{name}_frames_per_s'))}/s"
-    if errors := can["error_counters"]:
+    errors = can["error_counters"]
+    if errors:
         text += f", error counters {errors[0]:.0f}/{errors[1]:.0f}"
-    state = can["state"], STATES.get(can["state"], "bold red")
+    state = (can["state"], STATES.get(can["state"], "bold red"))
     yield line(f"CAN {can['channel']}: ", state, text)
-    shown = {"sent_frames": "sent", "dropped_frames": "dropped", "send_failures": "send failures"}
-    shown |= {"bus_off_count": "bus-off", "id_conflicts": "id conflicts"}
-    counts = ", ".join(f"{number(can['counters'][key])} {what}" for key, what in shown.items())
+    labels = {
+        "sent_frames": "sent",
+        "dropped_frames": "dropped",
+        "send_failures": "send failures",
+        "bus_off_count": "bus-off",
+        "id_conflicts": "id conflicts",
+    }
+    counts = ", ".join(f"{number(can['counters'][key])} {label}" for key, label in labels.items())
     yield from wrapped(f"     in all: {counts}", "dim", _WIDTH)
 
 
 def _esc_rows(document: Document) -> Iterator[list[Part]]:
     yield [(head, "dim") for head in _WIDTHS]
     for esc in document["escs"]:
-        values, counters, link = esc["values"], esc["counters"], esc["link"]
-        age = esc["data_age_ms"]
+        values = esc["values"]
+        counters = esc["counters"]
+        link = esc["link"]
+        style = STATES.get(link, "bold red") if esc["fresh"] else "bold red"
         yield [
             esc["name"][:12],
-            (words(link)[:10], STATES.get(link, "bold red") if esc["fresh"] else "bold red"),
+            (words(link)[:10], style),
             number(esc["frame_rate_hz"]),
-            "-" if age is None else f"{age:.0f} ms" if age < 1000 else duration(round(age * MS)),
+            _age(esc["data_age_ms"]),
             number(values["battery_voltage"], 2),
             number(values["battery_current"], 1),
             number(values["motor_speed"]),
@@ -279,11 +322,18 @@ def _esc_rows(document: Document) -> Iterator[list[Part]]:
         ]
 
 
+def _age(age_ms: float | None) -> str:
+    if age_ms is None:
+        return "-"
+    return f"{age_ms:.0f} ms" if age_ms < 1000 else duration(round(age_ms * MS))
+
+
 def alarms(document: Document) -> list[tuple[str, Alarm]]:
-    """Errors and warnings that the ESCs report, each after the ESC's name."""
+    """Return the errors and warnings that the ESCs report, each with its ESC's name."""
     found = []
     for esc in document["escs"]:
-        bits, flags = protocol_named(esc.get("protocol")).bits, []
+        bits = protocol_named(esc.get("protocol")).bits
+        flags: list[Alarm] = []
         for key in ("errors", "selftest_errors", "warnings"):
             severity = Severity.WARNING if key == "warnings" else Severity.ERROR
             for name in esc[key] or ():
@@ -293,18 +343,23 @@ def alarms(document: Document) -> list[tuple[str, Alarm]]:
 
 
 def _further(document: Document) -> Iterator[Text]:
-    """The CANopen nodes with their PDOs per second, stored parameters, captures."""
+    """Yield lines about CANopen nodes and their PDOs per second, stored parameters and captures."""
     rates = (document.get("rates") or {}).get("pdos_per_s", [])
-    for at, node in enumerate(document["nodes"]):
-        rate = f", {rates[at]:.0f} PDOs/s" if at < len(rates) else ""
-        state = f"node {node['node_id']} {node['state']}{rate}"
-        yield line(f"{node['esc']}: {'waits for LSS' if node['node_id'] is None else state}")
-    for output in document.get("outputs", {}).values():  # 0.5.0 had none
+    for index, node in enumerate(document["nodes"]):
+        state = "waits for LSS"
+        if node["node_id"] is not None:
+            state = f"node {node['node_id']} {node['state']}"
+            if index < len(rates):
+                state += f", {rates[index]:.0f} PDOs/s"
+        yield line(f"{node['esc']}: {state}")
+    for output in document.get("outputs", {}).values():  # documents of 0.5.0 do not have it
         for text in output["lines"]:
             yield from wrapped(printable(text), "", _WIDTH)
-    if (store := document["store"]) and store["waiting"] > 0:
+    store = document["store"]
+    if store and store["waiting"] > 0:
         yield line((f"{store['waiting']} parameters wait for the disk", "yellow"))
-    if (recording := document["recording"]) and recording["file"]:
+    recording = document["recording"]
+    if recording and recording["file"]:
         lost = f", {recording['lost']:.0f} entries lost" if recording["lost"] else ""
         size = f"{recording['bytes'] / 1e6:.1f} MB"
         yield line(f"recording to {recording['file']}, {size}", (lost, "yellow"))

@@ -1,4 +1,4 @@
-"""Watching a source: a live screen with keys, lines without a terminal, or documents."""
+"""Watches a source: a live screen with keys, lines without a terminal, or JSON documents."""
 
 import contextlib
 import os
@@ -24,14 +24,17 @@ from kontronik_can_gw.times import SECOND
 
 REFRESH_S = 0.15
 _LINES_S = 1.0
-"""Time between tables without a terminal."""
+"""Time between two tables without a terminal."""
 _QUIT = ("q", "\x03", "\x04")
 
 Stopped = Callable[[], bool]
 
 
 def watch(source: Source, monitor: Monitor, stopped: Stopped) -> None:
-    """Show the source until a key, ``stopped``, or without a terminal the end of a file."""
+    """Show the source until a key is pressed or ``stopped`` returns True.
+
+    Without a terminal, the end of a file ends it, too.
+    """
     console = Console(highlight=False)
     monitor.advance(source.now())
     if console.is_terminal and not console.is_dumb_terminal:
@@ -41,8 +44,9 @@ def watch(source: Source, monitor: Monitor, stopped: Stopped) -> None:
 
 
 def _live(console: Console, source: Source, monitor: Monitor, stopped: Stopped) -> None:
-    """Draw the screen again and again, and after each key."""
-    page, due = 0, time.monotonic()
+    """Draw the screen at a fixed rate, and after each key."""
+    page = 0
+    due = time.monotonic()
     with _keys() as fd, Live(console=console, screen=True, auto_refresh=False) as live:
         while not stopped():
             now = time.monotonic()
@@ -57,19 +61,25 @@ def _live(console: Console, source: Source, monitor: Monitor, stopped: Stopped) 
                 with contextlib.suppress(OSError):
                     typed = os.read(fd, 64)
                 key = typed.decode("ascii", "ignore").lower()
-                if not typed or key in _QUIT:  # nothing: the terminal is closed
+                if not typed or key in _QUIT:  # no byte: the terminal is closed
                     return
-                page, due = obey(key, source, monitor, page), now
+                page = obey(key, source, monitor, page)
+                due = now
 
 
 def obey(key: str, source: Source, monitor: Monitor, page: int) -> int:
-    """Do what a key asks for; return the number of the ESC whose page is shown then, 0 for all."""
+    """Execute the command of a key. Return the number of the page to show.
+
+    This is the number of an ESC, or 0 for the table of all ESCs.
+    """
     count = len(monitor.escs)
     match key:
         case "r":
             monitor.reset()
-        case "n" | "p":
-            return (page + (1 if key == "n" else -1)) % (count + 1)
+        case "n":
+            return (page + 1) % (count + 1)
+        case "p":
+            return (page - 1) % (count + 1)
         case "a" | "\x1b":
             return 0
         case " " if source.is_file:
@@ -81,7 +91,10 @@ def obey(key: str, source: Source, monitor: Monitor, page: int) -> int:
 
 @contextlib.contextmanager
 def _keys() -> Iterator[int | None]:
-    """Have single keys read without echo; Ctrl-C and Ctrl-Z are keys too. None where standard input is no terminal of ours."""
+    """Set the terminal so that single keys can be read without echo, also Ctrl-C and Ctrl-Z.
+
+    Yields the file descriptor, or None if standard input is not this process's terminal.
+    """
     try:
         fd = sys.stdin.fileno()
         is_ours = os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
@@ -101,19 +114,26 @@ def _keys() -> Iterator[int | None]:
 
 
 def _lines(source: Source, monitor: Monitor, stopped: Stopped) -> None:
-    """Print notices and the table again and again, without terminal control."""
+    """Print notices and the table at a fixed rate, without terminal control."""
     while not stopped() and not source.ended:
         due = time.monotonic() + _LINES_S
         while time.monotonic() < due and not source.ended and not stopped():
             source.pump(monitor.take, due)
         monitor.advance(source.now())
-        said = [line for text, _ in notices(monitor, source) for line in wrapped(text, "", 80)]
-        for line in (*said, *table_of(monitor.escs, 80), *alarms(monitor.escs, 80)):
+        lines: list[Text] = []
+        for text, _ in notices(monitor, source):
+            lines += wrapped(text, "", 80)
+        lines += table_of(monitor.escs, 80)
+        lines += alarms(monitor.escs, 80)
+        for line in lines:
             print(line.plain.rstrip(), flush=True)
 
 
 def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> dict[str, Any]:
-    """The document after each cyclic message has come, or ``timeout`` (s); of a file that at its end. RunError without a frame."""
+    """Return the document after all cyclic messages were received, or after ``timeout`` (s).
+
+    The document of a file shows its end. Raises RunError if no frame was received.
+    """
     end = time.monotonic() + timeout
     while not stopped() and not source.ended:
         now = time.monotonic()
@@ -122,11 +142,13 @@ def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> 
         source.pump(monitor.take, now + REFRESH_S)
     monitor.advance(source.now())
     if not monitor.view.frames and not stopped():
-        file, name = monitor.file, source.name
+        file = monitor.file
+        name = source.name
         if source.is_file:
             raise RunError(f"{name}: holds no frame of {file}. Give its DBC (--dbc).")
         silence = f"no frame of {file} on {name} for {timeout:g} s."
-        raise RunError(source.problem or " ".join([silence, *source.hints]))
+        reason = " ".join([silence, *source.hints])
+        raise RunError(source.problem or reason)
     return _document(source, monitor, source.now())
 
 
@@ -135,7 +157,7 @@ def stream(
 ) -> None:
     """Write a document for each second of the source's clock, and one at the end of a file.
 
-    Seconds of a bus that this process missed, for example while its reader was slow, are left out.
+    Seconds of a bus are left out if this process missed them, for example because of a slow reader.
     """
     monitor.advance(source.now())
     due = source.now() + SECOND
@@ -143,10 +165,13 @@ def stream(
     def write_until(now: int) -> None:
         nonlocal due
         if not source.is_file and now > due:
-            due += (now - due) // SECOND * SECOND
+            missed = (now - due) // SECOND
+            due += missed * SECOND
         while due <= now:
             monitor.advance(due)
-            write(_document(source, monitor, due) | {"problem": source.problem or None})
+            document = _document(source, monitor, due)
+            document["problem"] = source.problem or None
+            write(document)
             due += SECOND
 
     def take(frame: CanFrame, now: int) -> None:
@@ -161,7 +186,7 @@ def stream(
 
 
 def _document(source: Source, monitor: Monitor, now: int) -> dict[str, Any]:
-    """Everything that the monitor has seen up to ``now`` on the source's clock."""
+    """Return the monitor's document with its time, for ``now`` on the source's clock."""
     wall = source.wall_ns()
     moment = None
     if wall is not None:

@@ -1,4 +1,7 @@
-"""The UART bytes of one ESC, which have no times: their live frames are taken to come a hundred times a second."""
+"""Reads the plain UART bytes of one ESC.
+
+The bytes have no times, so 100 telemetry frames a second are assumed.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -30,8 +33,11 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.player import Player
 
 CHUNK = 1 << 16
+"""Number of bytes that are read at once."""
 PERIOD_NS = 10 * MS
+"""Assumed period of the telemetry frames."""
 _BEGINS_OF_HEADER = (b"KO", b"K")
+"""Incomplete headers, the longest first."""
 
 
 class BytesInput(PlayedInput):
@@ -43,16 +49,17 @@ class BytesInput(PlayedInput):
         layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
         if len(layout.escs) != 1:
             raise UserError(
-                f"{path}: holds the bytes of one ESC, {layout.layout.file} describes {len(layout.escs)}"
+                f"{path}: holds the bytes of one ESC, "
+                f"{layout.layout.file} describes {len(layout.escs)}"
             )
         self._path = path
         timeout_ns = max(layout.escs[0].timeout_ns, 3 * PERIOD_NS)
-        escs = (replace(layout.escs[0], timeout_ns=timeout_ns),)
-        setup = CaptureSetup(escs, (str(path),), None, DbcConfig(), False)
+        esc = replace(layout.escs[0], timeout_ns=timeout_ns)
+        setup = CaptureSetup((esc,), (str(path),), None, DbcConfig(), False)
         super().__init__(str(path), layout, setup)
         self.stream = stream
         self._head = b""
-        """The first bytes, as far as they have been read."""
+        """The first bytes of the recording, at most ``HEAD``."""
         self.provenance["times"] = "assumed: 100 live frames a second"
         if layout.config is None:
             self.provenance["motor"] = (
@@ -60,16 +67,19 @@ class BytesInput(PlayedInput):
             )
 
     def entries(self) -> Iterator[Entry]:
-        """The bytes up to each frame's end, at the frame's time."""
-        now = given = 0
+        """Yield the bytes up to each frame's end as an entry at the frame's time."""
+        now = 0
+        given = 0
         held = bytearray()
+        """Bytes that the decoder has received and that are not part of an entry yet."""
 
         def hold(pieces: Iterator[bytes]) -> Iterator[bytes]:
             for data in pieces:
                 held.extend(data)
                 yield data
 
-        for now, reading in self._found(PROTOCOLS[0].make(), hold(self.esc_bytes(0))):
+        decoder = PROTOCOLS[0].make()
+        for now, reading in self._read_frames(decoder, hold(self.esc_bytes(0))):
             size = reading.offset + reading.form.length - given
             yield Entry(now, Kind.BYTES, data=bytes(held[:size]))
             del held[:size]
@@ -77,7 +87,7 @@ class BytesInput(PlayedInput):
         if held:
             yield Entry(now, Kind.BYTES, data=bytes(held))
 
-    def esc_bytes(self, esc: int) -> Iterator[bytes]:  # noqa: ARG002  there is one
+    def esc_bytes(self, esc: int) -> Iterator[bytes]:  # noqa: ARG002  there is only one ESC
         self._head = b""
         try:
             with self._open() as file:
@@ -95,13 +105,13 @@ class BytesInput(PlayedInput):
         if self.stream is not None:
             self.stream.close()
 
-    def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  nobody knows when it was
+    def wall_ns(self, time_ns: int) -> int | None:  # noqa: ARG002  it is unknown at any time
         return None
 
     def _play(
         self, gateway: Gateway, player: "Player | None" = None
     ) -> "Iterator[list[TimedFrame] | Frames]":
-        # it runs before the first byte
+        # the gateway is started before it receives the first byte
         gateway.port(0, True, 0)
         gateway.start(0)
         if self.marked:
@@ -109,24 +119,28 @@ class BytesInput(PlayedInput):
         if player is not None:
             yield from self._play_in_c(player)
             return
-        core, now, waiting = cast(PythonCore, gateway.core), 0, TransmitQueue()
+        core = cast(PythonCore, gateway.core)
+        waiting = TransmitQueue()
+        now = 0
 
-        def frames(now: int) -> list[TimedFrame]:
+        def advance(now: int) -> list[TimedFrame]:
             gateway.advance(now)
-            return [TimedFrame(now, one) for one in in_order(gateway.take_frames(now), waiting)]
+            frames = in_order(gateway.take_frames(now), waiting)
+            return [TimedFrame(now, frame) for frame in frames]
 
-        for now, reading in self._found(core.escs[0].decoder):
+        for now, reading in self._read_frames(core.escs[0].decoder):
             while (due := gateway.next_deadline()) < now:
-                yield frames(due)
+                yield advance(due)
             core.accept(0, reading, now)
             gateway.take_link_changes()
-            yield frames(now)
-        yield frames(now)
+            yield advance(now)
+        yield advance(now)
 
     def _play_in_c(self, player: "Player") -> "Iterator[Frames]":
-        """The same, and what ``_found`` does."""
+        """Do the work of ``_play`` and ``_read_frames`` in C."""
         player.set_bytes(PERIOD_NS)
-        rest, begin = b"", 0
+        rest = b""
+        begin = 0
         for data in chain(self.esc_bytes(0), (None,)):
             rest = rest[player.position - begin :] + (data or b"")
             begin = player.position
@@ -135,16 +149,20 @@ class BytesInput(PlayedInput):
             yield player.take_frames()
         self._describe_damage(player.counters)
 
-    def _found(
+    def _read_frames(
         self, decoder: Any, read: Iterator[bytes] | None = None
     ) -> Iterator[tuple[int, Reading]]:
-        """Each frame at its time: a live frame each period, an info frame half a period after it.
+        """Yield each frame with its time.
 
-        The decoder is given the bytes up to the next header with it: its counters are of that time.
+        Live frames have a distance of one period. An info frame follows a live frame after half a
+        period. When a frame is yielded, the decoder has received the bytes up to the next header,
+        so its counters have the values of that time.
         """
-        now = lives = 0
+        now = 0
+        lives = 0
         for piece in chain(_pieces(read or self.esc_bytes(0)), (b"",)):
-            for frame in decoder.feed(piece) if piece else decoder.flush():
+            frames = decoder.feed(piece) if piece else decoder.flush()
+            for frame in frames:
                 if not frame.form.is_info:
                     now = lives * PERIOD_NS
                     lives += 1
@@ -159,13 +177,17 @@ class BytesInput(PlayedInput):
             self.refusal = self._refusal(counters)
         if counters.dropped_bytes:
             self.damage.append(
-                f"{counters.dropped_bytes} bytes belong to no frame, {counters.crc_errors} CRC errors"
+                f"{counters.dropped_bytes} bytes belong to no frame, "
+                f"{counters.crc_errors} CRC errors"
             )
         if not counters.live:
             self.damage.append(counters.diagnosis() or "no live frame")
 
     def _refusal(self, counters: Counters) -> UserError | None:
-        """The error for a recording of another kind, and for bytes that are none."""
+        """Return the error for a recording of another format, and for a file that is no recording.
+
+        None if the bytes are an ESC's.
+        """
         name = name_of(self._path)
         try:
             found = format_of(self._head, name, diagnosis=counters.diagnosis())
@@ -180,13 +202,18 @@ class BytesInput(PlayedInput):
 
 
 def _pieces(read: Iterator[bytes]) -> Iterator[bytes]:
-    """The bytes of a file, cut in front of each header. Only a header that is not complete is held back."""
+    """Yield the bytes of a file, cut before each header. Only an incomplete header is held back."""
     rest = b""
     for data in read:
         first, *others = (rest + data).split(UART_MAGIC)
-        pieces = [first, *(UART_MAGIC + other for other in others)]
-        last = pieces.pop()
-        rest = next((begin for begin in _BEGINS_OF_HEADER if last.endswith(begin)), b"")
-        yield from filter(None, (*pieces, last[: len(last) - len(rest)]))
+        pieces = [first]
+        pieces += [UART_MAGIC + other for other in others]
+        rest = b""
+        for begin in _BEGINS_OF_HEADER:
+            if pieces[-1].endswith(begin):
+                rest = begin
+                pieces[-1] = pieces[-1].removesuffix(begin)
+                break
+        yield from filter(None, pieces)
     if rest:
         yield rest

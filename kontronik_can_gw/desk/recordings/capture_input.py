@@ -1,4 +1,7 @@
-"""Captures of one run, in the order of their parts: header, data blocks, the wall clock, and an account of what is damaged."""
+"""Reads the captures of one run: headers, data blocks and wall clock, in the order of the parts.
+
+Damaged blocks are left out and listed.
+"""
 
 import re
 import tomllib
@@ -33,10 +36,16 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.player import Player
 
 CHUNK = 1 << 18
+"""Number of bytes that are read at once."""
 _PLAYED = frozenset({Kind.BYTES, Kind.ADVANCE, Kind.COUNTERS})
-"""What a player plays, and by which frames of the turn before are certain."""
+"""Kinds of entries that a player plays.
+
+After one of these, it is certain that the frames of the previous turn were sent.
+"""
 _LOOK_FOR_HEADER = 1 << 25
+"""Number of bytes of a part in which the header is looked for."""
 _MAX_DAMAGE = 50
+"""Number of damaged places that are listed."""
 _STEP_NS = 100_000_000
 """A smaller change of the wall clock is a correction and not reported."""
 
@@ -50,39 +59,45 @@ class CaptureInput(PlayedInput):
         self._file: IO[bytes] | None = None
         self.header = self._first_header()
         first = self._paths[0]
+        sent_layout = NO_MESSAGES
         try:
             setup = CaptureSetup.of(self.header)
-            found = setup.database()
-            setup.gateway(NO_MESSAGES if found is None else found[1], 0)
-        except Exception as error:  # a header may hold anything
-            problems = ["the header cannot be used: it is not as a recorder writes it"]
-            if isinstance(error, UserError):
-                problems = list(error.problems)
-            elif isinstance(error, HeaderError):
-                problems = [str(error)]
-            raise UserError(*(f"{first}: {problem[:400]}" for problem in problems)) from None
+            recorded = setup.database()
+            if recorded is not None:
+                sent_layout = recorded[1]
+            setup.gateway(sent_layout, 0)
+        except Exception as error:  # a damaged header can cause any exception
+            raise _header_error(first, error) from None
         name = str(first)
         if len(self._paths) > 1:
-            name = f"{first.parent}/{first.stem.rpartition('-')[0]}"
+            run = first.stem.rpartition("-")[0]
+            name = f"{first.parent}/{run}"
         if layout is not None:
             layout = shown_by(layout, setup.escs)
-        elif found is not None:
-            layout = BusLayout(found[0], found[1], setup.escs)
+        elif recorded is not None:
+            layout = BusLayout(recorded[0], sent_layout, setup.escs)
         else:
             layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"), setup.escs)
         super().__init__(name, layout, setup)
-        self.sent_layout = NO_MESSAGES if found is None else found[1]
-        self.created_ns = int(self.header.get("created_ns") or self.header.get("monotonic_ns") or 0)
+        self.sent_layout = sent_layout
+        created_ns = self.header.get("created_ns") or self.header.get("monotonic_ns")
+        self.created_ns = int(created_ns or 0)
         self._begun = _clock_of(self.header) or (0, 0)
-        self._last_ns = self._impossible = 0
+        """Time of the recording at its start, and the offset of the wall clock then."""
+        self._last_ns = 0
+        """Time of the previous entry."""
+        self._impossible = 0
+        """Number of entries that were left out because of their times."""
         self._place = ""
-        """Of the block that is being read, in words."""
+        """File and position of the block that is being read, for messages."""
         self._devices: list[Any] = list(self.header.get("devices") or [])
         self._describe()
 
     def wall_ns(self, time_ns: int) -> int | None:
-        offsets = (offset for since, offset in reversed(self._offsets) if since <= time_ns)
-        return time_ns + next(offsets, self._begun[1])
+        for since_ns, offset_ns in reversed(self._offsets):
+            if since_ns <= time_ns:
+                return time_ns + offset_ns
+        return time_ns + self._begun[1]
 
     @property
     def clock_steps(self) -> Sequence[ClockStep]:
@@ -97,10 +112,13 @@ class CaptureInput(PlayedInput):
     @property
     def channel(self) -> str:
         try:
-            channel = str(tomllib.loads(self.setup.configuration)["can"]["channel"])
+            configuration = tomllib.loads(self.setup.configuration)
+            channel = str(configuration["can"]["channel"])
         except (ValueError, LookupError, TypeError, RecursionError):
-            channel = ""
-        return channel if re.fullmatch(r"[\w.:@/-]{1,64}", channel, re.ASCII) else "can0"
+            return "can0"
+        if re.fullmatch(r"[\w.:@/-]{1,64}", channel, re.ASCII):
+            return channel
+        return "can0"
 
     def close(self) -> None:
         if self._file is not None:
@@ -108,7 +126,7 @@ class CaptureInput(PlayedInput):
             self._file = None
 
     def entries(self) -> Iterator[Entry]:
-        """All entries. What is damaged is left out, and reported in ``damage``."""
+        """Yield all entries. Damaged ones are left out and reported in ``damage``."""
         for payload in self._payloads():
             yield from self._entries_of(payload)
 
@@ -122,8 +140,10 @@ class CaptureInput(PlayedInput):
     ) -> "Iterator[list[TimedFrame] | Frames]":
         replay = Replay(gateway, self.header.get("state"), self.marked)
         for frames in self._steps(replay, player):
-            if player is not None and len(sent := player.take_frames()):
-                yield sent
+            if player is not None:
+                sent = player.take_frames()
+                if len(sent):
+                    yield sent
             yield frames
         if player is not None:
             yield player.take_frames(final=True)
@@ -136,43 +156,59 @@ class CaptureInput(PlayedInput):
             self.damage.append(f"{replay.rejected} entries make no sense to this version")
 
     def _steps(self, replay: Replay, player: "Player | None") -> Iterator[list[TimedFrame]]:
-        """Give all entries to a replay's gateway; the frames that Python made of each, or nothing where ``player`` gave some.
+        """Play all entries on the gateway of ``replay``. Yield the frames of each entry.
 
-        The player plays what comes all the time. Any other entry, and the rest of its turn, is played here.
+        The player, if there is one, plays the frequent kinds of entries. Each other entry and the
+        rest of its turn are played by ``replay``. For the player's entries an empty list is
+        yielded; the caller takes their frames from the player.
         """
-        here = True
+        if player is None:
+            for payload in self._payloads():
+                for entry in self._entries_of(payload):
+                    yield replay.play(entry)
+            return
+        in_python = True
+        """True if ``replay`` plays the next entry."""
         for payload in self._payloads():
-            if player is None or not player.begin(payload):
-                if player is not None:
-                    here = True
-                    yield []
-                    replay.go_on(list(timed(player.take_frames(final=True))))
+            if not player.begin(payload):
+                in_python = True
+                yield []
+                replay.go_on(list(timed(player.take_frames(final=True))))
                 for entry in self._entries_of(payload):
                     yield replay.play(entry)
                 continue
             while (kind := player.next_kind) is not None:
-                if here or (replay.frames_wait and kind not in _PLAYED):  # it may still drop them
-                    here = here if kind == Kind.NOT_SENT else kind != Kind.ADVANCE
-                    if (found := self._checked(entry_at(payload, *player.skip()))) is not None:
-                        yield replay.play(found)
+                # waiting frames may still be dropped by an entry that the player does not play
+                if in_python or (replay.frames_wait and kind not in _PLAYED):
+                    if kind != Kind.NOT_SENT:
+                        in_python = kind != Kind.ADVANCE
+                    entry = entry_at(payload, *player.skip())
+                    checked = self._checked(entry)
+                    if checked is not None:
+                        yield replay.play(checked)
                 else:
                     yield replay.finish()
-                    here, self._last_ns = player.play(self._last_ns)
+                    in_python, self._last_ns = player.play(self._last_ns)
                     yield []
-                    if here:
+                    if in_python:
                         replay.go_on(list(timed(player.take_frames(final=True))))
 
     def _entries_of(self, payload: bytes) -> Iterator[Entry]:
         try:
             for entry in read_entries(payload, self.setup.version):
-                if (found := self._checked(entry)) is not None:
-                    yield found
+                checked = self._checked(entry)
+                if checked is not None:
+                    yield checked
         except ValueError as error:
-            self._damaged(f"{self._place} {error}")
+            self._add_damage(f"{self._place} {error}")
 
     def _checked(self, entry: Entry) -> Entry | None:
-        """The entry; not before the one before. None where it has no possible time."""
-        time_ns, is_clock = entry.time_ns, entry.kind == Kind.CLOCK
+        """Return the entry at a time not before the previous entry. None if its time is impossible.
+
+        A clock entry also sets the offset of the wall clock.
+        """
+        time_ns = entry.time_ns
+        is_clock = entry.kind == Kind.CLOCK
         wall_ns = 0
         if is_clock and len(entry.data) == 8:
             (wall_ns,) = read_numbers(entry.data)
@@ -180,7 +216,7 @@ class CaptureInput(PlayedInput):
             self._impossible += 1
             return None
         if is_clock:
-            # it stands after what was written by the clock before
+            # entries of the same time were written before the clock was set
             self._offsets.append((time_ns + 1, wall_ns - time_ns))
         if time_ns < self._last_ns:
             return entry._replace(time_ns=self._last_ns)
@@ -188,26 +224,37 @@ class CaptureInput(PlayedInput):
         return entry
 
     def _describe(self) -> None:
-        """Say in ``provenance`` what is known by now."""
-        header, setup, program = self.header, self.setup, self.header.get("program", {})
-        version, python = program.get("version", "?"), program.get("python", "?")
-        layout = f", layout {header['layout']}" if isinstance(header.get("layout"), str) else ""
+        """Update ``provenance`` with the data of the header and the devices."""
+        header = self.header
+        setup = self.setup
+        program = header.get("program", {})
+        version = program.get("version", "?")
+        python = program.get("python", "?")
+        part = int(header.get("part", 0)) + 1
+        dbc = ""
+        if setup.dbc:
+            dbc = setup.dbc[0]
+            if isinstance(header.get("layout"), str):
+                dbc += f", layout {header['layout']}"
         self.provenance |= {
             "program": f"kontronik-can-gw {version}, Python {python}",
             "machine": str(program.get("machine", "")),
-            "run": f"{header.get('run', '')}, part {int(header.get('part', 0)) + 1}",
+            "run": f"{header.get('run', '')}, part {part}",
             "configuration": setup.file,
-            "DBC": setup.dbc[0] + layout if setup.dbc else "",
+            "DBC": dbc,
         }
         for index, (esc, port) in enumerate(zip(setup.escs, setup.ports, strict=False)):
-            device = self._devices[index] if index < len(self._devices) else None
             known = "device not known"
-            if isinstance(device, dict):
-                known = f"{device.get('device')} {device.get('variant')}, firmware {device.get('firmware')}, {device.get('layout')} layout"
+            if index < len(self._devices) and isinstance(self._devices[index], dict):
+                device = self._devices[index]
+                known = (
+                    f"{device.get('device')} {device.get('variant')}, "
+                    f"firmware {device.get('firmware')}, {device.get('layout')} layout"
+                )
             self.provenance[esc.name] = f"{known}, at {port}"
 
     def _first_header(self) -> Mapping[str, Any]:
-        """The header of the first part that has one; those before it are left out."""
+        """Return the header of the first part that has one. Parts before it are left out."""
         while True:
             path = self._paths[0]
             for found in self._blocks(path, _LOOK_FOR_HEADER):
@@ -217,7 +264,8 @@ class CaptureInput(PlayedInput):
             self.close()
             if len(self._paths) == 1:
                 raise UserError(
-                    f"{path}: has no header that could be read, so nothing is known of what was recorded"
+                    f"{path}: has no header that could be read, "
+                    "so nothing is known of what was recorded"
                 )
             self._headerless.append(f"{path.name}: has no header that could be read")
             del self._paths[0]
@@ -233,36 +281,44 @@ class CaptureInput(PlayedInput):
         yield from scanner.flush()
 
     def _payloads(self) -> Iterator[bytes]:
-        """The data blocks of all parts. What the other blocks tell goes into ``damage`` and ``provenance``."""
-        self._last_ns = self._impossible = 0
+        """Yield the data blocks of all parts. Other blocks update the state of this object.
+
+        ``damage`` is filled while the parts are read.
+        """
+        self._last_ns = 0
+        self._impossible = 0
         self.damage = list(self._headerless)
         self._offsets = []
         for number, path in enumerate(self._paths):
-            expected, ended = 0, False
+            expected = 0
+            is_closed = False
             for found in self._blocks(path):
                 if isinstance(found, Damage):
                     text = f"{found.length} bytes at {found.offset} are damaged"
-                    self._damaged(f"{path.name}: {text}")
+                    self._add_damage(f"{path.name}: {text}")
                     continue
-                if missing := max(0, found.number - expected):
+                missing = found.number - expected
+                if missing > 0:
                     text = f"{missing} blocks in front of byte {found.offset} are missing"
-                    self._damaged(f"{path.name}: {text}")
-                expected, ended = found.number + 1, found.kind == b"E"
+                    self._add_damage(f"{path.name}: {text}")
+                expected = found.number + 1
+                is_closed = found.kind == b"E"
                 self._place = f"{path.name}: the block at {found.offset}"
                 if found.kind == b"D":
                     yield found.payload
                 elif found.kind in (b"I", b"H"):
                     self._read_json(found, path, number)
-            if not ended:
+            if not is_closed:
                 text = "was not closed: up to the last second before its end may be missing"
-                self._damaged(f"{path.name}: {text}")
+                self._add_damage(f"{path.name}: {text}")
         if self._impossible:
             self.damage.append(f"{self._impossible} entries have no possible time")
 
-    def _damaged(self, text: str) -> None:
-        if len(self.damage) <= _MAX_DAMAGE:
-            is_last = len(self.damage) == _MAX_DAMAGE
-            self.damage.append("and more of that kind" if is_last else text)
+    def _add_damage(self, text: str) -> None:
+        if len(self.damage) < _MAX_DAMAGE:
+            self.damage.append(text)
+        elif len(self.damage) == _MAX_DAMAGE:
+            self.damage.append("and more of that kind")
 
     def _read_json(self, block: DataBlock, path: Path, part: int) -> None:
         try:
@@ -273,16 +329,18 @@ class CaptureInput(PlayedInput):
                 self._devices = found.get("devices", self._devices)
                 self._describe()
         except ValueError as error:
-            self._damaged(f"{self._place} {error}")
+            self._add_damage(f"{self._place} {error}")
 
     def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
         if header.get("run") != self.header.get("run"):
             raise UserError(
                 f"{path}: is of another run than {self._paths[0]}. Convert each run by itself."
             )
-        if (clock := _clock_of(header)) is not None:
+        clock = _clock_of(header)
+        if clock is not None:
             self._offsets.append(clock)
-        number, first = header.get("part", part), self.header.get("part", 0)
+        number = header.get("part", part)
+        first = self.header.get("part", 0)
         if type(number) is not int:
             raise ValueError("has a part that is no number")
         missing = number - int(first) - part
@@ -293,8 +351,21 @@ class CaptureInput(PlayedInput):
 
 
 def _clock_of(header: Mapping[str, Any]) -> tuple[int, int] | None:
-    """A moment, and how much more Unix time was then; None where the header's times are none."""
-    now, wall = header.get("monotonic_ns"), header.get("wall_ns")
-    if all(isinstance(at, int) and 0 <= at <= LATEST_NS for at in (now, wall)):
-        return int(now or 0), int(wall or 0) - int(now or 0)
-    return None
+    """Return the header's monotonic time, and Unix time minus it. None if they are impossible."""
+    now = header.get("monotonic_ns")
+    wall = header.get("wall_ns")
+    if not isinstance(now, int) or not isinstance(wall, int):
+        return None
+    if not (0 <= now <= LATEST_NS and 0 <= wall <= LATEST_NS):
+        return None
+    return int(now), int(wall) - int(now)
+
+
+def _header_error(path: Path, error: Exception) -> UserError:
+    """Return the message for a header that cannot be used because of ``error``."""
+    problems = ["the header cannot be used: it is not as a recorder writes it"]
+    if isinstance(error, UserError):
+        problems = list(error.problems)
+    elif isinstance(error, HeaderError):
+        problems = [str(error)]
+    return UserError(*(f"{path}: {problem[:400]}" for problem in problems))

@@ -1,6 +1,7 @@
-"""A recording to a table, a log of CAN frames or plain bytes: the work of ``convert``, without its messages.
+"""Converts a recording to a table, a log of CAN frames or plain bytes.
 
-Each conversion returns what it wrote, in words; None where the recording has nothing of it, and then nothing was written.
+Each conversion returns a text that describes the written data, or None if the recording has no such
+data. In that case nothing was written. Messages are the work of cli/convert.py.
 """
 
 import os
@@ -34,36 +35,39 @@ SUFFIXES = {
     ".bin": BYTES,
 }
 ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
-"""What may go to standard output or through a pipe: it is text, and is written from its beginning to its end."""
+"""Formats that can be written to standard output or a pipe: they are text, written in order."""
 
 
 class Output:
     """The destination of converted data: a file, or standard output if ``target`` is None.
 
-    A file is written as ``NAME.part`` beside its destination and takes its name at the end, if ``is_whole`` was set. Pipes and devices such
-    as /dev/stdout are written to directly. ``what``: how a user names the destination.
+    A file is written as ``NAME.part`` beside its destination. It is renamed at the end if
+    ``is_whole`` was set. Pipes and devices such as /dev/stdout are written directly. ``what`` is
+    the noun for the destination in messages.
     """
 
     keeps_part = False
-    """True: if writing fails, ``NAME.part`` stays with the data so far, because its input cannot be read again."""
+    """True if ``NAME.part`` is kept when writing fails, because the input cannot be read again."""
 
     def __init__(self, target: Path | None, what: str = "file") -> None:
         self.is_whole = False
         self.watch: Callable[[Iterable[Any]], Iterable[Any]] = iter
         """All converted data pass through this, block by block."""
-        self._target, self._what = target, what
+        self._target = target
+        self._what = what
         self._file: IO[bytes] | None = None
         self._part: Path | None = None
         """The file that may have been created."""
 
     @property
     def kept_part(self) -> Path | None:
-        """After a failure: the file with the data so far, if it was kept."""
-        is_there = self.keeps_part and self._part is not None and self._part.exists()
-        return self._part if is_there else None
+        """The file with the data so far, if it was kept after a failure."""
+        if self.keeps_part and self._part is not None and self._part.exists():
+            return self._part
+        return None
 
     def open(self) -> IO[bytes]:
-        """The file to write to. RunError if it cannot be opened."""
+        """Open the file for writing. Raises RunError if that fails."""
         target = self._target
         if target is None:
             return sys.stdout.buffer
@@ -73,8 +77,8 @@ class Output:
             else:
                 part = Path(os.path.realpath(target)).with_name(f"{target.name}.part")
                 part.unlink(missing_ok=True)
-                self._part = part  # a signal may come before the file is known
-                self._file = part.open("xb")  # follows no link that somebody put there
+                self._part = part  # before the file is opened, because a signal may interrupt
+                self._file = part.open("xb")  # does not follow a link that another user made
         except OSError as error:
             raise RunError(
                 f"{target}: cannot be written: {error.strerror}. Give another {self._what}."
@@ -91,8 +95,9 @@ class Output:
             sys.stdout.flush()
         try:
             if self._file is not None:
-                # buffered data of a file that is not kept may find no room
-                with suppress(*([] if is_kept else [OSError])):
+                # the disk may be full, which does not matter if the file is not kept
+                ignored = () if is_kept else (OSError,)
+                with suppress(*ignored):
                     self._close(self._file, is_kept)
             if is_kept and self._part is not None and self._target is not None:
                 self._part.replace(os.path.realpath(self._target))
@@ -109,11 +114,11 @@ class Output:
                 file.flush()
                 os.fsync(file.fileno())
         finally:
-            file.close()  # else Python tries again at its own end, and says so
+            file.close()  # otherwise Python tries again when it exits, and prints an error
 
 
 def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> str | None:
-    """To a table."""
+    """Convert a recording to a table. ``form`` is one of TABLES."""
     from kontronik_can_gw.desk.recordings.fields import Table
     from kontronik_can_gw.desk.recordings.recording import part_of
 
@@ -127,13 +132,16 @@ def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> st
     table = Table(fields, has_utc, origin_ns, recording.provenance)
     file = out.open()
     _flush_before_waits(recording, file)
-    count, last_ns = _write_all(_table_writer(file, form, table), blocks, out)
-    lasted = last_ns - origin_ns
-    return f"{counted(count, 'row')} of {counted(len(fields), 'value')}, up to {lasted / 1e9:.3f} s"
+    writer = _table_writer(file, form, table)
+    count, last_ns = _write_all(writer, blocks, out)
+    rows = counted(count, "row")
+    values = counted(len(fields), "value")
+    seconds = (last_ns - origin_ns) / 1e9
+    return f"{rows} of {values}, up to {seconds:.3f} s"
 
 
 def _table_writer(file: IO[bytes], form: str, table: "Table") -> Any:
-    """What has ``write`` for blocks of rows; RunError where a library is missing."""
+    """Return a writer of blocks of rows. Raises RunError if a library is missing."""
     from kontronik_can_gw.desk.recordings.tables import ParquetTable, TextTable
 
     if form == "parquet":
@@ -148,7 +156,10 @@ def to_log(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> str | None:
-    """To a log of CAN frames (a format of can_logs), from ``start_ns`` to ``end_ns`` after the recording's first frame."""
+    """Convert a recording to a log of CAN frames. ``form`` is a key of LOGS.
+
+    Frames from ``start_ns`` to ``end_ns`` after the recording's first frame are written.
+    """
     from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
     from kontronik_can_gw.desk.recordings.recording import part_of
 
@@ -158,14 +169,13 @@ def to_log(
     origin_ns, batches = found
     recording.begin_ns = origin_ns
     wall_ns = recording.wall_ns(origin_ns)
-    known = wall_ns, origin_ns, recording.channel, recording.provenance
     file = out.open()
     _flush_before_waits(recording, file)
-    writer = CanLogWriter(file, form, *known)
+    writer = CanLogWriter(file, form, wall_ns, origin_ns, recording.channel, recording.provenance)
     count, last_ns = _write_all(writer, batches, out)
-    lasted = last_ns - origin_ns
     frames_written = counted(count - sum(writer.left_out.values()), "CAN frame")
-    summary = f"{frames_written}, up to {lasted / 1e9:.3f} s"
+    seconds = (last_ns - origin_ns) / 1e9
+    summary = f"{frames_written}, up to {seconds:.3f} s"
     for what, number in writer.left_out.items():
         summary += f"; {counted(number, what)} left out, which {form} does not know"
     if writer.channels.changes:
@@ -180,10 +190,11 @@ def _flush_before_waits(recording: "Input", file: IO[bytes]) -> None:
 
 
 def _write_all(writer: Any, items: Iterator[Any], out: Output) -> tuple[int, int]:
-    """Write blocks of rows or batches of frames; how many of these, and the time of the last."""
+    """Write blocks of rows or batches of frames. Return the number of items and the last time."""
     from kontronik_can_gw.desk.recordings.recording import time_at
 
-    count = last_ns = 0
+    count = 0
+    last_ns = 0
     try:
         for some in out.watch(items):
             writer.write(some)
@@ -198,7 +209,7 @@ def _write_all(writer: Any, items: Iterator[Any], out: Output) -> tuple[int, int
 
 
 def to_bytes(recording: "Input", out: Output, esc: int) -> str | None:
-    """To the plain bytes of one ESC."""
+    """Convert a recording to the plain bytes of one ESC."""
     file = out.open()
     _flush_before_waits(recording, file)
     count = 0

@@ -1,9 +1,9 @@
-"""What a table has: its fields beside the time, those that are wanted, and what is known of where it came from."""
+"""The columns of a table, the choice among them, and the table's metadata."""
 
 import fnmatch
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from enum import Enum
@@ -20,14 +20,18 @@ TIME = "Time"
 UTC = "Utc"
 _OWN = (TIME, UTC)
 Read = Callable[[Any, GatewayStatus, int], Value]
-"""Gives a value of an EscTelemetry (None for one of the gateway), or of the GatewayStatus, at a time; None where it is not fresh."""
+"""A function that returns a value at a time, or None if the value is not fresh.
+
+Its arguments are the EscTelemetry (None for the gateway's own values), the GatewayStatus and the
+time.
+"""
 LEFT_OUT = frozenset({"sent_frames"})
-"""Only the frames themselves show it: they are not made for a table."""
+"""Values that need the CAN frames, which are not made for a table."""
 _ORDER = (Group.LIVE, Group.LINK, Group.INFO, Group.GATEWAY)
 
 
 class Kind(Enum):
-    """What a field's values are. All may be missing."""
+    """The type of a field's values. Any value may be missing."""
 
     FLAG = "flag"
     WHOLE = "whole"
@@ -37,26 +41,30 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Field:
-    """A column of a table. ``texts``: number and text of each value that a text can have."""
+    """A column of a table. Its values are read from CAN frames or from the bytes of an ESC."""
 
     name: str
     unit: str
     kind: Kind
     message: str = ""
-    """Of a value that came in a CAN frame."""
+    """Name of the CAN message. Empty for values from bytes."""
     texts: tuple[tuple[int, str], ...] = ()
+    """Number and text of each possible value of kind TEXT."""
     source: str = ""
-    """A name of values.py."""
+    """The value's name in values.py."""
     esc: int | None = None
-    """Index of the ESC; None for the gateway's own."""
+    """Index of the ESC. None for the gateway's own values."""
     signal: str = ""
-    """Name of the signal in the DBC, of a value that came in a CAN frame."""
+    """Name of the signal in the DBC. Empty for values from bytes."""
     high: float = math.inf
-    """The greatest value, at which a counter begins again."""
+    """The greatest value. A counter begins again after it."""
     value: EscValue | None = None
-    """As its ESC supplies it, of a value that came of its bytes."""
+    """The definition of the value as its ESC supplies it. None for values from CAN frames."""
     period_ns: int | None = None
-    """Of a value that came in a CAN frame: the longest time between two of them, 0 for one with each telemetry frame."""
+    """The longest time between two values in CAN frames. 0: one with each telemetry frame.
+
+    None if unknown, and for values from bytes.
+    """
 
     @property
     def header(self) -> str:
@@ -65,10 +73,11 @@ class Field:
 
     @property
     def reader(self) -> Read:
-        """Gives the value, or its text."""
+        """The function that reads the value, or its text, from the state of an ESC."""
         value = self.value
         assert value is not None
-        names, is_whole = value.names, self.kind in (Kind.FLAG, Kind.WHOLE)
+        names = value.names
+        is_whole = self.kind in (Kind.FLAG, Kind.WHOLE)
 
         def read(esc: Any, status: GatewayStatus, now: int) -> Value:
             found = steps(value, esc, status, now)
@@ -83,34 +92,43 @@ class Field:
 
 @dataclass(frozen=True)
 class Table:
-    """The frame of a table. ``has_utc``: its rows have Unix times. ``origin_ns``: the recording's time at the table's time 0."""
+    """The description of a table."""
 
     fields: Sequence[Field]
     has_utc: bool
+    """True if the rows have Unix times."""
     origin_ns: int = 0
+    """The recording's time at the table's time 0."""
     provenance: Mapping[str, str] = field(default_factory=dict)
 
 
 def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
-    """A field for each value, of all ESCs and then of the gateway; with several ESCs named ``esc1.battery_voltage``."""
+    """Return a field for each value of all ESCs, followed by those of the gateway.
+
+    If there are several ESCs, their names precede the values' names: ``esc1.battery_voltage``.
+    """
     found = []
-    for index, esc in [*enumerate(escs), (None, None)]:
-        prefix = f"{esc.name}." if esc is not None and len(escs) > 1 else ""
-        every = (VALUES if esc is None else values_of_esc(esc)).values()
+    for index, esc in enumerate(escs):
+        prefix = f"{esc.name}." if len(escs) > 1 else ""
+        values = values_of_esc(esc).values()
         for group in _ORDER:
-            found += [
-                _field(value, prefix, index)
-                for value in every
-                if value.group is group
-                and (group is Group.GATEWAY) is (esc is None)
-                and value.supplied
-                and value.name not in LEFT_OUT
-            ]
+            if group is not Group.GATEWAY:
+                found += _fields_of_group(values, group, prefix, index)
+    found += _fields_of_group(VALUES.values(), Group.GATEWAY, "", None)
     return found
 
 
+def _fields_of_group(
+    values: Iterable[EscValue], group: Group, prefix: str, esc: int | None
+) -> list[Field]:
+    return [
+        _field(value, prefix, esc)
+        for value in values
+        if value.group is group and value.supplied and value.name not in LEFT_OUT
+    ]
+
+
 def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
-    texts = tuple(sorted(value.names.items()))
     high = math.inf if value.high is None else value.high / value.per_unit
     kind = Kind.FLOAT
     if value.names:
@@ -119,14 +137,23 @@ def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
         kind = Kind.FLAG
     elif value.per_unit == 1 and value.divisor is Divisor.ONE:
         kind = Kind.WHOLE
-    name = prefix + value.name
-    return Field(name, value.unit, kind, "", texts, value.name, esc, high=high, value=value)
+    return Field(
+        name=prefix + value.name,
+        unit=value.unit,
+        kind=kind,
+        texts=tuple(sorted(value.names.items())),
+        source=value.name,
+        esc=esc,
+        high=high,
+        value=value,
+    )
 
 
 def distinct(fields: Sequence[Field]) -> list[Field]:
-    """The fields; names that several have, or that a table itself uses, with the message in front: ``Message.Name``.
+    """Return the fields with distinct names.
 
-    Where a message has a value twice, the names of its signals.
+    If several fields have a name, or the table itself uses it, the message precedes it:
+    ``Message.Name``. If a message has a value twice, the names of its signals are used.
     """
     counts = Counter(one.name for one in fields)
     within = Counter((one.message, one.name) for one in fields)
@@ -134,20 +161,24 @@ def distinct(fields: Sequence[Field]) -> list[Field]:
     def name_of(one: Field) -> str:
         if within[one.message, one.name] > 1:
             return f"{one.message}.{one.signal or one.name}"
-        return f"{one.message}.{one.name}" if counts[one.name] > 1 or one.name in _OWN else one.name
+        if counts[one.name] > 1 or one.name in _OWN:
+            return f"{one.message}.{one.name}"
+        return one.name
 
     return [replace(one, name=name_of(one)) for one in fields]
 
 
 def column_of(fields: Sequence[Field], source: str, esc: int | None) -> int | None:
-    """Index of the first field with a value of values.py; None where there is none."""
-    places = (i for i, one in enumerate(fields) if (one.source, one.esc) == (source, esc))
-    return next(places, None)
+    """Return the index of the first field with a value of values.py. None if there is none."""
+    for index, one in enumerate(fields):
+        if one.source == source and one.esc == esc:
+            return index
+    return None
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What of a recording is wanted. Times in ns since its start, ``end_ns`` included."""
+    """The part of a recording that is wanted. Times are in ns since its start, both included."""
 
     columns: Sequence[int]
     start_ns: int | None = None
@@ -155,24 +186,24 @@ class Choice:
 
     @classmethod
     def of(cls, fields: Sequence[Field], names: Sequence[str] = (), **times: Any) -> "Choice":
-        """The fields with one of these names (with * and ?). UserError for a name that fits none.
+        """Choose the fields with one of these names, which may contain ``*`` and ``?``.
 
-        Case, underscores and dots do not matter, nor ``Percent`` at the end. With several ESCs a name may be that of a value alone; of
-        a CAN log it may be the signal's.
+        Case, underscores, dots and a final ``Percent`` do not matter. The name of an ESC may be
+        left out. In a CAN log, the name of a signal can be given, too. Raises UserError if a name
+        matches no field. Without names, all fields are chosen.
         """
-        chosen: dict[int, None] = {} if names else dict.fromkeys(range(len(fields)))
+        if not names:
+            return cls([*range(len(fields))], **times)
+        chosen: dict[int, None] = {}
         problems = []
-        known = [
-            {_plain(one.name), _plain(one.name.rpartition(".")[2]), _plain(one.signal)} - {""}
-            for one in fields
-        ]
+        known = [_possible_names(one) for one in fields]
         for name in names:
             wanted = _plain(name)
             forms = {wanted, wanted.removesuffix("percent")} - {""}
             found = [
                 index
-                for index, called in enumerate(known)
-                if any(fnmatch.filter(called, form) for form in forms)
+                for index, possible in enumerate(known)
+                if any(fnmatch.filter(possible, form) for form in forms)
             ]
             if not found:
                 shown = {_plain(one.name): one.name for one in reversed(fields)}
@@ -183,6 +214,12 @@ class Choice:
         if problems:
             raise UserError(*problems)
         return cls([*chosen], **times)
+
+
+def _possible_names(field: Field) -> set[str]:
+    """Return the names by which a user can choose a field."""
+    without_esc = field.name.rpartition(".")[2]
+    return {_plain(field.name), _plain(without_esc), _plain(field.signal)} - {""}
 
 
 def _plain(name: str) -> str:

@@ -5,8 +5,9 @@ from kontronik_can_gw.desk.recordings.log_input import candump_advice, log_forma
 from kontronik_can_gw.desk.recordings.stream import HEAD
 from kontronik_can_gw.errors import UserError
 
-CAPTURE, BYTES = "capture", "bytes"
-"""Formats besides those of ``log_format``."""
+CAPTURE = "capture"
+BYTES = "bytes"
+"""The formats that ``log_format`` does not find."""
 UART_MAGIC = b"KOD"
 """The first bytes of every telemetry frame."""
 
@@ -14,19 +15,21 @@ UART_MAGIC = b"KOD"
 def format_of(
     head: bytes, name: str, *, is_capture: bool = False, diagnosis: str | None = None
 ) -> str:
-    """The format of a recording by its head. UserError if it is none.
+    """Return the format of a recording with this head. Raises UserError if it is no recording.
 
-    ``diagnosis``: why the bytes are not those of an ESC, for the error.
+    ``diagnosis``: the reason why the bytes are not an ESC's, for the error.
     """
     if not head.strip():
         raise UserError(f"{name}: is empty")
     if is_capture or MAGIC in head:
         return CAPTURE
-    if (found := log_format(head)) is not None:
-        return found
+    log = log_format(head)
+    if log is not None:
+        return log
     if UART_MAGIC in head:
         return BYTES
-    if (advice := candump_advice(head)) is not None:
+    advice = candump_advice(head)
+    if advice is not None:
         raise UserError(f"{name}: {advice}")
     reason = "" if diagnosis is None else f" ({diagnosis})"
     raise UserError(

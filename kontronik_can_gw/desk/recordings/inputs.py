@@ -1,9 +1,11 @@
 """Opens recordings of every kind: captures, logs of CAN frames, and plain UART bytes of one ESC.
 
-A capture (.kcap) is played through the gateway's core with the recorded clock. Plain UART bytes have no times: their live frames are
-assumed to arrive at a fixed rate. ``open_input`` finds the format from the content.
+A capture (.kcap) is played through the gateway's core with the recorded clock. Plain UART bytes
+have no times: their live frames are assumed to arrive at a fixed rate. ``open_input`` finds the
+format from the content.
 
-A pipe is read as its data arrive if it carries UART bytes or candump text. Other formats are copied to a temporary file first.
+A pipe is read as its data arrive if it carries UART bytes or candump text. Other formats are copied
+to a temporary file first.
 """
 
 import io
@@ -28,13 +30,16 @@ __all__ = ["BytesInput", "CanLogInput", "CaptureInput", "Input", "open_input"]
 
 
 def open_input(path: Path, layout: BusLayout | None = None) -> Input:
-    """Open a recording. UserError if it is missing, cannot be opened or is not a recording.
+    """Open a recording. Raises UserError if it is missing, unreadable or not a recording.
 
-    ``path``: a file, a named pipe, or ``-`` for standard input. A folder of captures, or the common prefix of their names, stands for
-    all parts of one run. ``layout``: of the frames in a CAN log and of those made from plain bytes, by default the shipped DBC of one
-    ESC. For a capture it replaces the recorded one.
+    ``path``: a file, a named pipe, or ``-`` for standard input. A folder of captures, or the common
+    prefix of their names, stands for all parts of one run.
+
+    ``layout``: the layout of the frames in a CAN log, and of the frames made from plain bytes. The
+    default is the shipped DBC of one ESC. For a capture it replaces the recorded layout.
     """
-    if (stream := open_stream(path)) is not None:
+    stream = open_stream(path)
+    if stream is not None:
         return _open_stream(stream, layout)
     parts = _parts(path)
     if parts is not None:
@@ -43,10 +48,10 @@ def open_input(path: Path, layout: BusLayout | None = None) -> Input:
 
 
 def open_bytes(path: Path, layout: BusLayout | None) -> Input:
-    """Open a file or a pipe as the bytes of one ESC, whatever its content is.
+    """Open a file or a pipe as the bytes of one ESC, regardless of its content.
 
-    UserError if it is missing or cannot be opened. If it is no recording, ``refusal`` is set at
-    its end.
+    Raises UserError if it is missing or cannot be opened. If it is not a recording, ``refusal`` is
+    set after its end was read.
     """
     stream = open_stream(path)
     if stream is None and not path.exists():
@@ -65,7 +70,8 @@ def _open_file(path: Path, layout: BusLayout | None) -> Input:
         return CaptureInput([path], layout)
     if found == BYTES:
         return BytesInput(path, layout)
-    return CanLogInput(path, layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc")), found)
+    layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+    return CanLogInput(path, layout, found)
 
 
 # --- pipes
@@ -87,14 +93,19 @@ def _open_stream(stream: Stream, layout: BusLayout | None) -> Input:
 
 
 def _format_of_stream(stream: Stream) -> str:
-    """Wait until the format is certain. A whole line of a log, or one intact frame of an ESC, is enough."""
+    """Wait until the format is certain.
+
+    A whole line of a log, or one intact frame of an ESC, is enough.
+    """
     decoder = PROTOCOLS[0].make()
     done = 0
     while len(stream.head) < HEAD and stream.look():
         head = stream.head
         if head.startswith(MAGIC):
             return CAPTURE
-        if (found := log_format(head[: head.rfind(b"\n") + 1] or head[:8])) is not None:
+        whole_lines = head[: head.rfind(b"\n") + 1]
+        found = log_format(whole_lines or head[:8])
+        if found is not None:
             return found
         if decoder.feed(head[done:]):
             return BYTES
@@ -104,14 +115,15 @@ def _format_of_stream(stream: Stream) -> str:
 
 def _open_spooled(stream: Stream, layout: BusLayout | None) -> Input:
     """Copy a stream to a temporary file without a name, and open that."""
-    file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  open as long as the recording
+    file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  stays open with the recording
     with ExitStack() as on_error:
         on_error.enter_context(file)
         try:
             shutil.copyfileobj(io.BufferedReader(stream, HEAD), file, HEAD)
         except OSError as error:
             raise RunError(
-                f"{tempfile.gettempdir()}: {stream.name} cannot be stored there: {error.strerror}. Set TMPDIR to a folder with more room."
+                f"{tempfile.gettempdir()}: {stream.name} cannot be stored there: "
+                f"{error.strerror}. Set TMPDIR to a folder with more room."
             ) from None
         path = Path(f"/proc/self/fd/{file.fileno()}")
         try:
@@ -128,22 +140,24 @@ def _open_spooled(stream: Stream, layout: BusLayout | None) -> Input:
 
 
 def _parts(path: Path) -> list[Path] | None:
-    """The captures that a folder, or the beginning of a name, means; None for a plain file."""
+    """Return the captures in a folder or with a common prefix. None if the path is a file."""
     if path.is_dir():
         found = sorted(path.glob(f"*{SUFFIX}"))
         if not found:
             raise UserError(f"{path}: has no captures (*{SUFFIX})")
     elif not path.exists():
-        every = path.parent.glob(f"*{SUFFIX}") if path.name else ()
-        found = sorted(part for part in every if part.name.startswith(path.name))
+        captures = path.parent.glob(f"*{SUFFIX}") if path.name else ()
+        found = sorted(part for part in captures if part.name.startswith(path.name))
         if not found:
             raise _missing(path)
     else:
         return None
-    runs = list(dict.fromkeys(p.name.removesuffix(SUFFIX).rpartition("-")[0] for p in found))
+    names = [part.name.removesuffix(SUFFIX) for part in found]
+    runs = list(dict.fromkeys(name.rpartition("-")[0] for name in names))
     if len(runs) > 1:
         raise UserError(
-            f"{path}: has captures of {len(runs)} runs; give the beginning of the names of one: {', '.join(runs[-8:])}"
+            f"{path}: has captures of {len(runs)} runs; "
+            f"give the beginning of the names of one: {', '.join(runs[-8:])}"
         )
     return found
 

@@ -1,4 +1,4 @@
-"""Which DBC describes frames of ours, and whose values they hold."""
+"""The DBC that describes a gateway's frames, and the ESCs whose values they contain."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,38 +22,45 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BusLayout:
-    """A DBC as it was read, and its layout. ``config``: where it came from, None for a DBC alone."""
+    """A DBC as it was read, and the layout compiled from it."""
 
     database: "Database"
     layout: Layout
     escs: Sequence[EscSettings]
     config: Config | None = None
+    """The configuration that names the DBC. None if the DBC was given alone."""
 
     def copies(self) -> dict[str, Copy]:
-        """The file's messages by their names on the bus."""
+        """Return the file's messages by their names on the bus."""
         layout = self.layout
-        settings = self.config.dbc if self.config else DbcConfig(node=layout.node)
+        settings = DbcConfig(node=layout.node)
+        if self.config is not None:
+            settings = self.config.dbc
         copies = copies_of(self.database, layout.file, self.escs, settings)
         return {copy.name: copy for copy in copies}
 
 
 def layout_of_dbc(file: Path, known: Sequence[EscSettings] = ()) -> BusLayout:
-    """A DBC alone. UserError where a signal means nothing.
+    """Return the layout of a DBC that was given without a configuration.
 
-    Its ESCs are those that the names of its signals begin with; a DBC of one ESC is made one of all that are ``known``. Pole pairs and gear
-    are those of the ``known`` ones, in their order, and 1 otherwise.
+    The names of its signals begin with the names of its ESCs. A DBC of one ESC is expanded to all
+    ``known`` ESCs. Pole pairs and gears are taken from the ``known`` ESCs in their order, and are 1
+    without them. Raises UserError if a signal has no known meaning.
     """
     database = load_database(file)
-    return _made(database, choose_node(database, None, str(file)), str(file), known)
+    node = choose_node(database, None, str(file))
+    return _compile_layout(database, node, str(file), known)
 
 
 def shown_by(layout: BusLayout, known: Sequence[EscSettings]) -> BusLayout:
-    """A layout that was given for a recording of these ESCs: one of a DBC alone takes their pole pairs and gears.
+    """Return the layout in which a recording of the ``known`` ESCs is shown.
 
-    UserError where it describes other ESCs than there are.
+    A DBC without a configuration takes their pole pairs and gears. Raises UserError if the layout
+    describes another number of ESCs.
     """
     if layout.config is None:
-        return _made(layout.database, layout.layout.node, layout.layout.file, known)
+        own = layout.layout
+        return _compile_layout(layout.database, own.node, own.file, known)
     if len(layout.escs) != len(known):
         raise UserError(
             f"{layout.config.file}: has {len(layout.escs)} ESCs, the recording {len(known)}"
@@ -61,21 +68,28 @@ def shown_by(layout: BusLayout, known: Sequence[EscSettings]) -> BusLayout:
     return layout
 
 
-def _made(database: "Database", node: str, file: str, known: Sequence[EscSettings]) -> BusLayout:
+def _compile_layout(
+    database: "Database", node: str, file: str, known: Sequence[EscSettings]
+) -> BusLayout:
     from kontronik_can_gw.dbc.prepare import prepare
 
     names = esc_names(database, node)
     if names and known and len(names) != len(known):
         raise UserError(f"{file}: describes {len(names)} ESCs, the recording has {len(known)}")
-    escs = list(known) or [EscSettings(name) for name in names] or [EscSettings("esc1")]
-    if names:
-        escs = [replace(esc, name=name) for esc, name in zip(escs, names, strict=True)]
+    escs = list(known)
+    if names and known:
+        escs = [replace(esc, name=name) for esc, name in zip(known, names, strict=True)]
+    elif not known:
+        escs = [EscSettings(name) for name in names or ["esc1"]]
     layout = prepare(database, file, escs, DbcConfig(node=node), fd_allowed=True)
     return BusLayout(database, layout, escs)
 
 
 def esc_names(database: "Database", node: str) -> list[str]:
-    """What stands in front of sources' names in the signals of ours, in the order of the messages; empty for a DBC of one ESC."""
+    """Return the ESCs' names, which precede the values' names in the signals of ``node``.
+
+    They have the order of the messages. Empty for a DBC of one ESC.
+    """
     groups = {normalize(name): value.group for name, value in VALUES.items()}
     known = [name for name, group in groups.items() if group is not Group.GATEWAY]
     counts: dict[str, int] = {}
@@ -86,7 +100,8 @@ def esc_names(database: "Database", node: str) -> list[str]:
             key = normalize(signal.name).removesuffix("percent")
             if key in groups:
                 continue
-            ending = max((name for name in known if key.endswith(name)), key=len, default="")
+            endings = [name for name in known if key.endswith(name)]
+            ending = max(endings, key=len, default="")
             name = signal.name.removesuffix("Percent")
             prefix = name[: len(name) - len(ending)].rstrip("_")
             if ending and prefix:

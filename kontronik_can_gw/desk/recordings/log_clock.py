@@ -28,7 +28,7 @@ _FAR_NS = 10 * SECOND_NS
 """A single frame that is farther away than this from its neighbours has a damaged time."""
 _DAY_NS = 86_400 * SECOND_NS
 _LONE_NS = SECOND_NS
-"""A single frame this far ahead does not count when the next frame goes back."""
+"""A single frame this far ahead does not count if the next frame has an earlier time."""
 _REMEMBERED = 256
 """Frames in which the periods of the ids are looked up."""
 
@@ -52,9 +52,12 @@ class LogClock:
         """Added to the times of the log since the last step."""
 
     def frames(self) -> Iterator[LogFrame]:
-        """The frames in their order, at continuous times."""
-        last = before = None
-        while (item := self._next()) is not None:
+        """Yield the frames in their order, at continuous times."""
+        last = None
+        before = None
+        ahead = self._ahead
+        source = self._source
+        while (item := ahead.popleft() if ahead else next(source, None)) is not None:
             time_ns = item.time_ns + self._shift_ns
             if last is None or before is None:
                 if self._is_alone(item):
@@ -68,7 +71,8 @@ class LogClock:
                 self.steps.append(ClockStep(time_ns, time_ns - last, is_kept=True))
                 last = before = time_ns
             elif time_ns >= last:
-                before, last = last, time_ns
+                before = last
+                last = time_ns
             elif last - time_ns > _DISORDER_NS:
                 if last - before > _LONE_NS and time_ns >= before - _DISORDER_NS:
                     last = max(before, time_ns)  # the frame before this one was too far ahead
@@ -83,11 +87,8 @@ class LogClock:
             self._recent.append(item)
             yield item
 
-    def _next(self) -> LogFrame | None:
-        return self._ahead.popleft() if self._ahead else next(self._source, None)
-
     def _look_ahead(self, count: int) -> Sequence[LogFrame]:
-        """The next frames, which stay to be read; fewer at the end of the log.
+        """Return the next frames without consuming them. There are fewer at the end of the log.
 
         A pipe may not have them yet, so a frame in its order must not need them.
         """
@@ -95,7 +96,7 @@ class LogClock:
         return list(islice(self._ahead, count))
 
     def _is_alone(self, first: LogFrame) -> bool:
-        """True if the log begins with a frame that is far later than the two after it, which agree."""
+        """Return True if the first frame is far later than the next two, which agree."""
         following = self._look_ahead(1)
         if not following or first.time_ns - following[0].time_ns <= _FAR_NS:
             return False
@@ -103,7 +104,7 @@ class LogClock:
         return len(following) == 2 and _follows(following[1], following[0])
 
     def _leads_back(self, item: LogFrame) -> bool:
-        """True if the times after this one go back again."""
+        """Return True if the times after this frame are far earlier again."""
         for count in (1, 2):
             following = self._look_ahead(count)
             if len(following) < count or _follows(following[-1], item):
@@ -117,7 +118,7 @@ class LogClock:
         return not following or _follows(following[0], item)
 
     def _agreeing(self, last: int) -> Sequence[LogFrame] | None:
-        """The next frames if enough of them are before ``last``, too; None otherwise."""
+        """Return the next frames if enough of them are before ``last``, too. None otherwise."""
         following = self._look_ahead(_STEP_FRAMES - 1)
         if len(following) < _STEP_FRAMES - 1:
             return None
@@ -125,7 +126,7 @@ class LogClock:
         return following if all(one.time_ns < limit_ns for one in following) else None
 
     def _set_back(self, item: LogFrame, following: Sequence[LogFrame], last: int) -> int:
-        """Record a step in front of ``item``; return the time at which the spacing continues."""
+        """Record a step before ``item``. Return the time at which the spacing continues."""
         time_ns = max(last, self._due_ns(item, following, last))
         by_ns = item.time_ns + self._shift_ns - time_ns
         self._shift_ns -= by_ns
@@ -133,7 +134,10 @@ class LogClock:
         return time_ns
 
     def _due_ns(self, item: LogFrame, following: Sequence[LogFrame], last: int) -> int:
-        """When ``item`` was due, by the periods of the ids: the median of the guesses."""
+        """Return the time at which ``item`` was due.
+
+        The periods of the ids give one estimate each. The result is their median.
+        """
         guesses: dict[object, int] = {}
         for one in (item, *following):
             name = _name(one)
@@ -142,7 +146,9 @@ class LogClock:
             earlier = (seen.time_ns for seen in reversed(self._recent) if _name(seen) == name)
             times = [*islice(earlier, 2)]
             if len(times) == 2:
-                guesses[name] = 2 * times[0] - times[1] - (one.time_ns - item.time_ns)
+                last_ns, before_ns = times
+                due_ns = 2 * last_ns - before_ns
+                guesses[name] = due_ns - (one.time_ns - item.time_ns)
         if not guesses:
             return last
         return sorted(guesses.values())[(len(guesses) - 1) // 2]

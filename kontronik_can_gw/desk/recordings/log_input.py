@@ -1,9 +1,9 @@
-"""Frames as a CAN tool logged them, as a recording; the format of a log is found out by its content."""
+"""Reads the log of a CAN tool as a recording. The content of its first lines shows its format."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import groupby, islice
+from itertools import islice
 from pathlib import Path
 
 from kontronik_can_gw.capture.replay import TimedFrame
@@ -21,28 +21,30 @@ from kontronik_can_gw.desk.recordings.recording import (
     LogFrame,
     Sample,
 )
-from kontronik_can_gw.desk.recordings.samples import ColumnMaker, fields_of_log, rows_of_frames
+from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.frames import EXTENDED
 
 _BATCH = 256
-"""Frames."""
+"""Number of frames in a batch."""
 STREAMED = ("candump",)
 """Formats that are read from a pipe as their data arrive."""
 _HEAD_LINES = 2000
+"""Number of lines in which the format is looked for."""
 _LOOK_FOR_CHANNELS = 10_000
-"""Frames in which further channels are looked for, once there are too many."""
+"""Number of frames in which further channels are looked for, once there are too many."""
 _BEGINNINGS = {b"LOGG": "blf", b"MDF     ": "mf4", b"UnFinMF ": "mf4"}
 _TEXTS: dict[str, tuple[Callable[[bytes], object], type[text.TextReader]]] = {
     "candump": (text.candump_line, text.CandumpReader),
     "asc": (asc.asc_line, asc.AscReader),
     "trc": (text.trc_line, text.TrcReader),
 }
-"""What matches a line of a format, and what reads it."""
+"""For each text format: a function that matches its lines, and its reader."""
 
 
 def log_format(head: bytes) -> str | None:
-    """The format of a log by its first bytes; None: no log."""
+    """Return the format of a log with these first bytes. None if it is not a log."""
     for magic, found in _BEGINNINGS.items():
         if head.startswith(magic):
             return found
@@ -54,9 +56,10 @@ def log_format(head: bytes) -> str | None:
 
 
 def candump_advice(head: bytes) -> str | None:
-    """What is wrong with the output of candump for the screen, and the remedy; None for other files."""
+    """Return the remedy for the output of candump for the screen. None for other files."""
     for line in head.split(b"\n", _HEAD_LINES)[:_HEAD_LINES]:
-        if (found := text.candump_screen_line(line)) is not None:
+        found = text.candump_screen_line(line)
+        if found is not None:
             interface = found["interface"].decode("ascii", "replace")
             return (
                 "is the output of candump for the screen. Record the log format: "
@@ -74,13 +77,17 @@ def _reader_of(format_: str) -> type[text.LogReader]:
 
 
 class CanLogInput(Input):
-    """A log of CAN frames. UserError for a table in MF4, RunError if it cannot be read."""
+    """A log of CAN frames.
+
+    Raises UserError for a table in MF4, and RunError if the log cannot be read.
+    """
 
     def __init__(
         self, path: Path, layout: BusLayout, format_: str, stream: Stream | None = None
     ) -> None:
         super().__init__(str(path), layout)
-        self._path, self._format = path, format_
+        self._path = path
+        self._format = format_
         self.stream = stream
         self._is_unread = True
         self._selected: str | None = None
@@ -93,18 +100,17 @@ class CanLogInput(Input):
 
     def _open(self) -> None:
         try:
-            self._file = (
-                self._path.open("rb", buffering=HEAD)
-                if self.stream is None
-                else StreamReader(self.stream)
-            )
+            if self.stream is None:
+                self._file = self._path.open("rb", buffering=HEAD)
+            else:
+                self._file = StreamReader(self.stream)
         except OSError as error:
             raise UserError(f"{self._path}: cannot be opened: {error.strerror}.") from None
         self._reader = _reader_of(self._format)(self._file)
         self._clock = LogClock(self._reader, is_live=self.stream is not None)
 
     def _rewind(self) -> None:
-        """Go to the beginning."""
+        """Open the log again, unless nothing of it was read."""
         if not self._is_unread:
             self.close()
             self._open()
@@ -115,35 +121,47 @@ class CanLogInput(Input):
 
     def batches(self) -> Iterator[list[LogFrame]]:
         frames = self._logged()
-        while some := list(islice(frames, _BATCH if self.stream is None else 1)):
+        size = _BATCH if self.stream is None else 1
+        while some := list(islice(frames, size)):
             yield some
 
     def frames(self) -> Iterator[TimedFrame]:
-        """The data frames of one channel: the selected one, or the only one with messages of the DBC.
+        for time_ns, frame, received, _ in self._data_frames():
+            yield TimedFrame(time_ns, frame, received is True)
 
-        UserError if several channels have such messages and none is selected. Frames of other
-        channels that are not in the DBC are among them.
+    def _data_frames(self) -> Iterator[LogFrame]:
+        """Yield the data frames of one channel.
+
+        It is the selected channel, or the only one with messages of the DBC. Frames that are not in
+        the DBC are yielded for all channels. Raises UserError if several channels have messages of
+        the DBC and no channel is selected.
         """
-        ours, chosen = self.reader.keys, self._selected
+        ours = self.reader.keys
+        chosen = self._selected
         self.others = 0
         logged = self._logged()
         for item in logged:
-            time_ns, frame, received, channel = item
-            if frame.remote or frame.can_id & ERROR:
-                self._without_data[channel, item.kind] += 1
+            frame = item.frame
+            can_id = frame.can_id
+            if frame.remote or can_id & ERROR:
+                self._without_data[item.channel, item.kind] += 1
                 continue
-            if frame.key not in ours:
+            if (can_id | EXTENDED if frame.extended else can_id) not in ours:
                 self.others += 1
-            elif chosen is None:
-                self._chosen = chosen = channel
-            elif channel != chosen:
-                raise self._ambiguous(logged)
-            yield TimedFrame(time_ns, frame, received is True)
+            elif item.channel != chosen:
+                if chosen is not None:
+                    raise self._ambiguous(logged)
+                self._chosen = chosen = item.channel
+            yield item
 
     def _logged(self) -> Iterator[LogFrame]:
-        """All frames, or those of the selected channel. UserError if the log does not have it."""
+        """Yield all frames, or the frames of the selected channel.
+
+        Raises UserError if the log does not have this channel.
+        """
         self._rewind()
-        clock, selected = self._clock, self._selected
+        clock = self._clock
+        selected = self._selected
         self._channels = {}
         self._chosen = selected
         self._without_data.clear()
@@ -151,7 +169,7 @@ class CanLogInput(Input):
         try:
             for item in clock.frames():
                 if before is None and item.time_ns >= text.OLDEST_WALL_S * text.SECOND_NS:
-                    self._reader.wall_start_ns = 0  # Unix times, whatever the head states
+                    self._reader.wall_start_ns = 0  # Unix times, even if the head has another start
                 if item.channel != before:
                     before = item.channel
                     self._channels[before] = None
@@ -168,13 +186,14 @@ class CanLogInput(Input):
             raise UserError(f"{self._path}: has no channel {selected}. It has: {listed}.")
 
     def _ambiguous(self, logged: Iterator[LogFrame]) -> UserError:
-        """The error for several channels with messages of the DBC, of which it lists all."""
+        """Return the error for several channels with messages of the DBC. It lists all channels."""
         for _ in islice(logged, _LOOK_FOR_CHANNELS):
             pass
         file = Path(self.bus.layout.file).name
         listed = ", ".join(sorted(self._channels))
         return UserError(
-            f"{self._path}: several channels have messages of {file}. Choose one with --channel: {listed}."
+            f"{self._path}: several channels have messages of {file}. "
+            f"Choose one with --channel: {listed}."
         )
 
     @property
@@ -190,12 +209,12 @@ class CanLogInput(Input):
         return fields_of_log(self.reader, self.bus.escs)
 
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
-        maker = ColumnMaker(self.reader, range(len(self.fields)) if chosen is None else chosen)
-        rows = rows_of_frames(self.frames(), self.reader)
-        while some := list(islice(rows, ROWS if self.stream is None else 1)):
-            for wall_ns, group in groupby(some, lambda row: self.wall_offset_ns(row[0])):
-                times, parts = zip(*group, strict=True)
-                yield Block(times, maker.columns(parts), wall_ns)
+        if chosen is None:
+            chosen = range(len(self.fields))
+        rows = RowsOfFrames(self.reader, chosen)
+        count = ROWS if self.stream is None else 1
+        for times, columns in rows.blocks(self._data_frames(), count):
+            yield Block(times, columns, self.wall_offset_ns(times[0]))
 
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
         return self.samples(chosen)
@@ -204,7 +223,7 @@ class CanLogInput(Input):
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")
 
     def wall_ns(self, time_ns: int) -> int | None:
-        """Unix time, which continues when the clock was set back."""
+        """Return the Unix time, which continues if the clock was set back."""
         start = self._reader.wall_start_ns
         if start is None or start > LATEST_NS:
             return None

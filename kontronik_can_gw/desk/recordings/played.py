@@ -1,4 +1,8 @@
-"""Recordings of what ESCs sent are played through the gateway's core: the one in C at full speed (native/player.py), else Python's."""
+"""Plays recorded bytes of ESCs through the gateway's core.
+
+The C core plays them at full speed (native/player.py). The Python core is used if the C core is
+not available.
+"""
 
 from abc import abstractmethod
 from bisect import bisect_left
@@ -42,29 +46,39 @@ class _RowOutput:
 
 
 class PlayedInput(Input):
-    """Bytes of ESCs, played through a gateway. ``sent_layout``: of its frames; that of the rows, ``bus``, may be another one."""
+    """Bytes of ESCs that are played through a gateway.
+
+    ``sent_layout`` is the layout of the gateway's frames. The layout of the rows, ``bus``, may
+    differ from it.
+    """
 
     created_ns = 0
-    """When the gateway was made: its cycles count from there."""
+    """Time at which the gateway was made. Its cycles count from this time."""
     marked = False
-    """True: the gateway's state in the frames is REPLAY."""
+    """True if the gateway's state in the frames is REPLAY."""
 
     def __init__(self, name: str, bus: BusLayout, setup: CaptureSetup) -> None:
         super().__init__(name, bus)
         self.setup = setup
         self.sent_layout = bus.layout
         self._offsets: list[tuple[int, int]] = []
-        """From when on, in the order of time, Unix time is so much more than the recording's."""
+        """Time since which an offset applies, and the offset, in the order of time.
+
+        The offset is Unix time minus the recording's time.
+        """
 
     @abstractmethod
     def entries(self) -> Iterator[Entry]:
-        """What was recorded, in its order; of plain bytes these at their times."""
+        """Yield the recorded entries in their order. Plain bytes are entries at assumed times."""
 
     @abstractmethod
     def _play(
         self, gateway: Gateway, player: "Player | None" = None
     ) -> "Iterator[list[TimedFrame] | Frames]":
-        """Give all that was recorded to a gateway, or to the player of its core; the CAN frames that were sent and received."""
+        """Play the recording on a gateway, or on the player of its core.
+
+        Yields the CAN frames that were sent and received.
+        """
 
     def frames(self) -> Iterator[TimedFrame]:
         for frames in self.batches():
@@ -74,8 +88,11 @@ class PlayedInput(Input):
         def make(_: Sequence[OutputMaker] = ()) -> Gateway:
             return self.setup.gateway(self.sent_layout, self.created_ns)
 
-        found = None if self.setup.outputs else self._player_of(make, None)
-        return self._play(*(found or (make(),)))
+        if not self.setup.outputs:
+            played = self._player_of(make, None)
+            if played is not None:
+                return self._play(*played)
+        return self._play(make())
 
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
         fields = [self.fields[index] for index in chosen]
@@ -85,9 +102,13 @@ class PlayedInput(Input):
         yield from rows.maker.finish()
 
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
-        fields = self.fields if chosen is None else [self.fields[index] for index in chosen]
+        fields = self.fields
+        if chosen is not None:
+            fields = [self.fields[index] for index in chosen]
         found = self._player_of(self._silent_gateway, fields)
-        return super().blocks(chosen) if found is None else self._played(*found)
+        if found is None:
+            return super().blocks(chosen)
+        return self._played(*found)
 
     def _played(self, gateway: Gateway, player: "Player") -> Iterator[Block]:
         done = 0
@@ -102,19 +123,20 @@ class PlayedInput(Input):
         yield from self._timed(player.take_rows(final=True), done)
 
     def _timed(self, rows: "Rows", begin: int) -> Iterator[Block]:
-        """The rows from ``begin`` on, in blocks during which the wall clock was not set."""
-        times, count = rows.times, rows.count
-        cuts = {max(begin, bisect_left(times, since)) for since, _ in self._offsets}
-        for first, end in pairwise(sorted({begin, count, *cuts})):
-            wall_ns = self.wall_ns(times[first])
-            yield PlayedBlock(rows, first, end, None if wall_ns is None else wall_ns - times[first])
+        """Yield the rows from ``begin`` in blocks during which the wall clock was not set."""
+        edges = {begin, rows.count}
+        for since_ns, _ in self._offsets:
+            edges.add(max(begin, bisect_left(rows.times, since_ns)))
+        for first, end in pairwise(sorted(edges)):
+            offset_ns = self.wall_offset_ns(rows.times[first])
+            yield PlayedBlock(rows, first, end, offset_ns)
 
     def _silent_gateway(self, readers: Sequence[OutputMaker]) -> Gateway:
         """Return a gateway without messages, whose outputs include ``readers``.
 
         Recorded outputs are there if they may have changed pole pairs and gear.
         """
-        # the caller shows names, pole pairs and gears
+        # Names, pole pairs and gears at the start are those of the layout that is shown.
         escs = [
             replace(own, name=shown.name, pole_pairs=shown.pole_pairs, gear=shown.gear)
             for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
@@ -125,18 +147,23 @@ class PlayedInput(Input):
     def _player_of(
         self, make: Callable[[Sequence[OutputMaker]], Gateway], fields: Sequence[Field] | None
     ) -> "tuple[Gateway, Player] | None":
-        """A gateway, and what plays it at once for rows of ``fields`` or for frames (None). None: Python must."""
+        """Return a gateway and the player of its C core. None if only the Python core can play it.
+
+        The player makes rows of ``fields``, or frames if ``fields`` is None.
+        """
         if self.setup.version == 1 or load.library()[0] is None:
             return None
         from kontronik_can_gw.native.offline import ColumnOf
         from kontronik_can_gw.native.player import Player
         from kontronik_can_gw.native.rows import NotInCore
 
-        columns = None
-        if fields is not None:
+        if fields is None:
+            player = Player(None)
+            gateway = make(())
+        else:
             columns = [ColumnOf(cast(Any, field.value), field.esc) for field in fields]
-        player = Player(columns)
-        gateway = make(() if fields is None else (ReadyOutput(player),))
+            player = Player(columns)
+            gateway = make((ReadyOutput(player),))
         if gateway.core.language != "C":
             return None
         try:

@@ -1,4 +1,4 @@
-"""What every recording is: CAN frames in order of time, and rows of values by name, many at once."""
+"""The interface of every recording: CAN frames in order of time, and rows of values by name."""
 
 from abc import ABC, abstractmethod
 from bisect import bisect_left, bisect_right
@@ -23,16 +23,17 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames, Rows
 
 Batch: TypeAlias = "list[TimedFrame] | list[LogFrame] | Frames"
-"""Frames in their order; ``Frames`` were all sent."""
+"""Frames in their order. The gateway sent all those of a ``Frames``."""
 ERROR = 0x20000000
 """Marks the id of an error frame, as SocketCAN does. No other id has this bit."""
 LATEST_NS = 1 << 62
-"""No time of a recording, and no Unix time (2116), is later: it is damaged."""
-ROWS = 1024
-"""Rows that Python makes a block of."""
+"""Latest possible time of a recording, and latest Unix time (2116). Later times are damaged."""
+ROWS = 512
+"""Number of rows in a block that Python makes. Longer blocks are slower: they exceed the cache."""
 _LISTED_STEPS = 3
+"""Number of clock steps that are listed."""
 _DISORDER_NS = 1_000_000_000
-"""How far frames of several interfaces may stand out of order."""
+"""Frames of several interfaces may be this far out of order."""
 
 
 class LogFrame(NamedTuple):
@@ -50,7 +51,7 @@ class LogFrame(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """What it is, for counts that people read."""
+        """The type of the frame, for counts that people read."""
         if self.frame.can_id & ERROR:
             return "error frame"
         return "remote frame" if self.frame.remote else "CAN frame"
@@ -69,14 +70,18 @@ class ClockStep(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A row. ``values``: in the order of the columns."""
+    """A row. ``values`` have the order of the columns."""
 
     time_ns: int
     values: tuple[Value, ...]
 
 
 class Block:
-    """Rows as columns. ``times``: ns of the recording's clock, which do not decrease; with ``wall_ns`` added they are Unix times."""
+    """Rows, stored as columns.
+
+    ``times`` are ns of the recording's clock and do not decrease. A time plus ``wall_ns`` is Unix
+    time. ``wall_ns`` is None if the time of day is unknown.
+    """
 
     def __init__(
         self, times: Sequence[int], columns: Sequence[Sequence[Any]], wall_ns: int | None
@@ -94,33 +99,40 @@ class Block:
         return self._columns
 
     def part(self, begin: int, end: int) -> "Block":
-        """Some of the rows."""
+        """Return the rows from index ``begin`` up to ``end``, which is not included."""
+        if (begin, end) == (0, len(self)):
+            return self
         columns = [column[begin:end] for column in self._columns]
         return Block(self.times[begin:end], columns, self.wall_ns)
 
     def between(self, low_ns: int, high_ns: int) -> Self:
-        """The rows from one time to another, both included."""
+        """Return the rows from one time to another, both included."""
         found: Self = between(self, low_ns, high_ns)
         return found
 
     def rows(self) -> Iterator[Sample]:
-        """The rows one by one."""
-        return map(Sample, self.times, zip(*self.columns, strict=True))
+        """Yield the rows one by one."""
+        values = zip(*self.columns, strict=True)
+        return map(Sample, self.times, values)
 
 
 class PlayedBlock(Block):
-    """Rows ``begin`` to ``end`` of what the core in C made."""
+    """Rows ``begin`` to ``end`` of the ``Rows`` that the C core made."""
 
     def __init__(self, rows: "Rows", begin: int, end: int, wall_ns: int | None) -> None:
         super().__init__(rows.times[begin:end], (), wall_ns)
-        self.made, self.begin, self.end = rows, begin, end
+        self.made = rows
+        self.begin = begin
+        self.end = end
 
     @cached_property
     def columns(self) -> Sequence[Sequence[Any]]:
         found: list[Sequence[Any]] = []
         for number, (value, _) in enumerate(self.made.columns):
             numbers: list[Any] = self.made.numbers(number, self.begin, self.end)
-            found.append([*map(value.names.get, numbers)] if value.names else numbers)
+            if value.names:
+                numbers = [*map(value.names.get, numbers)]
+            found.append(numbers)
         return found
 
     def part(self, begin: int, end: int) -> "PlayedBlock":
@@ -128,65 +140,73 @@ class PlayedBlock(Block):
 
 
 class Input(ABC):
-    """A recording. Each of ``frames``, ``blocks``, ``esc_bytes`` reads it from its beginning, a stream only once.
+    """A recording.
 
-    ``damage`` has a line for each part that is not intact. It is complete after the recording was read to its end.
+    1. ``frames``, ``blocks`` and ``esc_bytes`` each read it from its beginning.
+    2. A recording that is a pipe can be read only once.
+    3. ``damage`` has a line for each part that is not intact. It is complete after the recording
+       was read to its end.
     """
 
     stream: Stream | None = None
-    """The pipe from which it is read as data arrive: blocks and batches are then returned as soon as they are complete."""
+    """The pipe from which the recording is read as data arrive.
+
+    Blocks and batches of a pipe are returned as soon as they are complete.
+    """
 
     def __init__(self, name: str, bus: BusLayout) -> None:
         self.name = name
         self.bus = bus
         self.provenance: dict[str, str] = {}
-        """What is known of where it came from, in words; ``times`` where these are assumed."""
+        """The known facts about its origin, as texts. ``times``: how times were assumed, if so."""
         self.damage: list[str] = []
         self.others = 0
-        """CAN frames that the layout does not have; complete when it was read to the end."""
+        """Number of CAN frames that are not in the layout. Complete after the end was read."""
         self.refusal: UserError | None = None
-        """The error for a file that turned out to be no recording, once it was read to its end."""
+        """The error for a file that proved to be no recording. Set after its end was read."""
         self.begin_ns = 0
         """Time 0 of the output, from which ``clock_notes`` count. Set by the conversion."""
         self.resources = ExitStack()
-        """Closed with the recording."""
+        """Resources that are closed with the recording."""
 
     @property
     def clock_steps(self) -> Sequence[ClockStep]:
-        """Where the wall clock was set; complete when the recording has been read to its end."""
+        """The steps of the wall clock. Complete after the recording was read to its end."""
         return ()
 
     @property
     def clock_notes(self) -> list[str]:
-        """One line for each kind of clock step, with its times and sizes; empty if there is none."""
+        """One line for each kind of clock step, with times and sizes. Empty without steps."""
         return _described(self.clock_steps, self.begin_ns)
 
     @property
     def without_data(self) -> Mapping[str, int]:
-        """Number of error frames and of remote frames by ``LogFrame.kind``, as far as it was read."""
+        """Numbers of error frames and remote frames by ``LogFrame.kind``, of the part read."""
         return {}
 
     @property
     def left_out(self) -> str:
-        """Which frames are not part of tables, pages and screens; empty if all are."""
+        """The frames that tables, pages and screens do not show, as a text. Empty without any."""
         parts = []
         if self.others:
             file = Path(self.bus.layout.file).name
             parts.append(
-                f"{self.others} CAN frames left out that {file} does not have (-c or --dbc gives another)"
+                f"{self.others} CAN frames left out that {file} does not have "
+                "(-c or --dbc gives another)"
             )
-        if counts := [counted(number, kind) for kind, number in self.without_data.items()]:
+        counts = [counted(number, kind) for kind, number in self.without_data.items()]
+        if counts:
             parts.append(f"{' and '.join(counts)} left out")
         return "; ".join(parts)
 
     @property
     def channel(self) -> str:
-        """The CAN channel that was sent on, where it is known."""
+        """The CAN channel on which frames were sent. ``can0`` if it is unknown."""
         return "can0"
 
     @cached_property
     def reader(self) -> SignalReader:
-        """Reads frames of ``bus``."""
+        """The reader of the frames of ``bus``."""
         return SignalReader(self.bus.layout)
 
     @cached_property
@@ -195,47 +215,54 @@ class Input(ABC):
         return fields_of_values(self.bus.escs)
 
     def select_channel(self, name: str) -> None:
-        """Read only one channel of a CAN log. UserError for other recordings."""
+        """Read only one channel of a CAN log. Raises UserError for other recordings."""
         raise UserError(
             f"{self.name}: is no CAN log, so --channel {name} means nothing. Leave it out."
         )
 
     @abstractmethod
     def frames(self) -> Iterator[TimedFrame]:
-        """The CAN frames of one bus that were sent (or would have been) and received."""
+        """Yield the CAN frames of one bus that were sent or received.
+
+        They are the frames that would have been sent if only the ESCs' bytes were recorded.
+        """
 
     @abstractmethod
     def batches(self) -> "Iterator[Batch]":
-        """The frames for a log, many at once: all channels, unless one was selected."""
+        """Yield the frames for a log in batches, of all channels unless one was selected."""
 
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
-        """Rows of the values of ``chosen`` fields, in that order; None: of all."""
-        samples = self.samples_in_python(range(len(self.fields)) if chosen is None else chosen)
-        # with each row, because a clock that was set later must not move the rows before it
-        found = ((self.wall_offset_ns(row.time_ns), *row) for row in samples)
-        while some := list(islice(found, ROWS if self.stream is None else 1)):
-            for wall_ns, rows in groupby(some, itemgetter(0)):
-                _, times, values = zip(*rows, strict=True)
-                yield Block(times, [*zip(*values, strict=True)], wall_ns)
+        """Yield rows of the values of the ``chosen`` fields, in that order. None: of all fields."""
+        if chosen is None:
+            chosen = range(len(self.fields))
+        samples = self.samples_in_python(chosen)
+        # the offset is taken with each row, so that a later clock step does not move earlier rows
+        rows = ((self.wall_offset_ns(row.time_ns), *row) for row in samples)
+        size = ROWS if self.stream is None else 1
+        while some := list(islice(rows, size)):
+            for wall_ns, group in groupby(some, itemgetter(0)):
+                _, times, values = zip(*group, strict=True)
+                columns = [*zip(*values, strict=True)]
+                yield Block(times, columns, wall_ns)
 
     def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        """The rows one by one."""
+        """Yield the rows one by one."""
         for block in self.blocks(chosen):
             yield from block.rows()
 
     @abstractmethod
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
-        """The rows one by one, whatever core there is."""
+        """Yield the rows one by one, made in Python even if the C core is available."""
 
     @abstractmethod
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
-        """The UART bytes of one ESC. UserError where the recording has none."""
+        """Yield the UART bytes of one ESC. Raises UserError if the recording has no such bytes."""
 
     @abstractmethod
     def wall_ns(self, time_ns: int) -> int | None:
-        """Unix time, where it is known."""
+        """Return the Unix time at ``time_ns``. None if the time of day is unknown."""
 
-    def close(self) -> None:  # noqa: B027  only some have any
+    def close(self) -> None:  # noqa: B027  some recordings have no files
         """Close the files."""
 
     def __enter__(self) -> Self:
@@ -246,13 +273,13 @@ class Input(ABC):
             self.close()
 
     def wall_offset_ns(self, time_ns: int) -> int | None:
-        """Unix time minus the recording's own time at ``time_ns``. None if the time of day is unknown."""
+        """Return Unix time minus the recording's time at ``time_ns``. None if it is unknown."""
         wall_ns = self.wall_ns(time_ns)
         return None if wall_ns is None else wall_ns - time_ns
 
 
 def counted(count: int, noun: str) -> str:
-    """A number with its noun: "1 row", "2 rows"."""
+    """Return a number with its noun: "1 row", "2 rows"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
@@ -261,14 +288,16 @@ def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:
     hidden = [step for step in steps if not step.is_kept]
     notes = []
     if hidden:
-        listed = [
-            ("back " if step.by_ns < 0 else "ahead ") + _by_and_after(step, step.time_ns - begin_ns)
-            for step in hidden
-        ]
+        listed = []
+        for step in hidden:
+            direction = "back" if step.by_ns < 0 else "ahead"
+            listed.append(f"{direction} {_by_and_after(step, step.time_ns - begin_ns)}")
         notes.append(f"the clock was set {_some_of(listed)}; times continue without the step")
     if kept:
-        # the time in front of the jump: the one behind it contains the jump
-        listed = [_by_and_after(step, step.time_ns - step.by_ns - begin_ns) for step in kept]
+        listed = []
+        for step in kept:
+            before_ns = step.time_ns - step.by_ns  # the time after the jump contains the jump
+            listed.append(_by_and_after(step, before_ns - begin_ns))
         notes.append(
             f"times jump ahead {_some_of(listed)}: a pause, or the clock was set; the jump is kept"
         )
@@ -276,55 +305,67 @@ def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:
 
 
 def _by_and_after(step: ClockStep, elapsed_ns: int) -> str:
-    """The size of a step, and the time since the beginning of the recording in front of it."""
+    """Describe the size of a step, and the time from the recording's beginning to the step."""
     return f"by {duration(abs(step.by_ns))} after {duration(elapsed_ns)}"
 
 
 def _some_of(listed: list[str]) -> str:
+    text = ", ".join(listed[:_LISTED_STEPS])
     more = len(listed) - _LISTED_STEPS
-    return ", ".join(listed[:_LISTED_STEPS]) + (f" and {more} more times" if more > 0 else "")
+    if more > 0:
+        text += f" and {more} more times"
+    return text
 
 
 def timed(frames: "Frames | list[TimedFrame]") -> Iterator[TimedFrame]:
-    """The frames one by one."""
+    """Return an iterator over the frames."""
     if isinstance(frames, list):
         return iter(frames)
     return (TimedFrame(time_ns, frame) for time_ns, frame in frames)
 
 
 def time_at(items: Any, index: int) -> int:
-    """Time of one of a Block, Frames or a list of TimedFrames."""
+    """Return the time of an item of a Block, Frames or list of TimedFrames."""
     found: int = items[index].time_ns if isinstance(items, list) else items.times[index]
     return found
 
 
 def between(items: Any, low_ns: int, high_ns: int) -> Any:
-    """Those of a Block, Frames or a list of TimedFrames that are from one time to another, both included."""
+    """Return the items from one time to another, both included.
+
+    ``items`` are a Block, Frames or a list of TimedFrames. The result has the same type.
+    """
     if isinstance(items, list):
         return [one for one in items if low_ns <= one.time_ns <= high_ns]
     begin = bisect_left(items.times, low_ns)
-    return items.part(begin, max(begin, bisect_right(items.times, high_ns)))
+    end = bisect_right(items.times, high_ns)
+    return items.part(begin, max(begin, end))
 
 
 def part_of(
     items: Iterable[Any], start_ns: int | None, end_ns: int | None
 ) -> tuple[int, Iterator[Any]] | None:
-    """What of Blocks, or of batches of frames, is from one time after their begin to another, both included (None: no limit).
+    """Return the part of a recording between two times after its beginning, both included.
 
-    With the time at which they begin. None where there is nothing.
+    ``items`` are Blocks or batches of frames. None as a time means no limit. Returns the time of
+    the recording's beginning and the items that are not empty, or None if the part is empty.
     """
     filled = filter(len, items)
-    if (first := next(filled, None)) is None:
+    first = next(filled, None)
+    if first is None:
         return None
     origin_ns = time_at(first, 0)
     if isinstance(first, list):  # frames of a log, which may be out of order
         origin_ns = min(item.time_ns for item in first)
-    low = -LATEST_NS if start_ns is None else origin_ns + start_ns
-    high = LATEST_NS if end_ns is None else origin_ns + end_ns
-    wanted = takewhile(
-        lambda some: time_at(some, 0) <= high + _DISORDER_NS, chain((first,), filled)
-    )
-    part = filter(len, (between(some, low, high) for some in wanted))
-    if (first := next(part, None)) is None:
+    low_ns = -LATEST_NS if start_ns is None else origin_ns + start_ns
+    high_ns = LATEST_NS if end_ns is None else origin_ns + end_ns
+
+    def is_near(some: Any) -> bool:
+        return time_at(some, 0) <= high_ns + _DISORDER_NS
+
+    wanted = takewhile(is_near, chain((first,), filled))
+    part = filter(len, (between(some, low_ns, high_ns) for some in wanted))
+    first = next(part, None)
+    if first is None:
         return None
     return origin_ns, chain((first,), part)

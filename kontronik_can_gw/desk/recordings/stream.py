@@ -1,4 +1,4 @@
-"""A recording that arrives through a pipe: it is read as its data arrive, and only once."""
+"""Reads a recording from a pipe as its data arrive. A pipe can be read only once."""
 
 import io
 import os
@@ -13,42 +13,45 @@ HEAD = 1 << 16
 """Bytes of a recording in which its format is looked for."""
 _STANDARD_INPUT = ("-", "/dev/stdin", "/dev/fd/0", "/proc/self/fd/0")
 _LAST_MS = 100
-"""How long ``end`` waits for data that are still on their way, each time."""
+"""Time for which each read after ``end`` waits for data that are still on their way."""
 _LAST_BYTES = 1 << 20
-"""How much is read after ``end``."""
+"""Number of bytes that are read after ``end``, at most."""
 
 
 class Stream(io.RawIOBase):
-    """Data of a pipe. Contract:
+    """The data of a pipe.
 
-    1. A read returns the data that are there, at least one byte, and waits only if there are none. b"" is the end.
+    1. A read returns the available data, at least one byte. It waits only if there are no data.
+       b"" is the end.
     2. ``before_wait`` is called each time before a read waits.
-    3. ``end`` may be called at any time, also by a signal handler. Reads then return what is still in the pipe, at most
-       1 MB, and after that b"".
+    3. ``end`` may be called at any time, also by a signal handler. After it, reads return the rest
+       of the data in the pipe, at most 1 MB, and then b"".
     """
 
     def __init__(self, fd: int, name: str) -> None:
         super().__init__()
         self.name = name
         self.head = b""
-        """The beginning as far as ``look`` has read it; reads return it first."""
+        """The beginning that ``look`` has read. Reads return it first."""
         self.before_wait: Callable[[], object] = lambda: None
         self.is_ended = False
         """True after ``end``."""
-        self._fd, self._wake = fd, os.eventfd(0)
-        self._data, self._data_or_wake = select.poll(), select.poll()
+        self._fd = fd
+        self._wake = os.eventfd(0)
+        self._data = select.poll()
         self._data.register(fd, select.POLLIN)
+        self._data_or_wake = select.poll()
         self._data_or_wake.register(fd, select.POLLIN)
         self._data_or_wake.register(self._wake, select.POLLIN)
         self._left = _LAST_BYTES
 
     def end(self) -> None:
-        """End the stream, as if nothing followed the data that are in the pipe."""
+        """End the stream after the data that are in the pipe."""
         self.is_ended = True
         os.eventfd_write(self._wake, 1)
 
     def look(self) -> bool:
-        """Read more of the head, without consuming it; False at the end of the stream."""
+        """Read more of the head without consuming it. Return False at the end of the stream."""
         more = self._receive(HEAD)
         self.head += more
         return bool(more)
@@ -75,23 +78,29 @@ class Stream(io.RawIOBase):
                     data = os.read(self._fd, min(size, self._left))
                 except BlockingIOError:
                     continue  # another reader of a non-blocking pipe was faster
-                self._left -= len(data) if self.is_ended else 0
+                if self.is_ended:
+                    self._left -= len(data)
                 return data
         except OSError as error:
             raise RunError(f"{self.name}: cannot be read: {error.strerror}.") from None
         return b""
 
     def _has_data(self) -> bool:
-        """Wait for data or the end of the pipe; False after ``end`` if none are left."""
+        """Wait for data or the end of the pipe. Return False after ``end`` if no data are left."""
         if not self.is_ended and not self._data.poll(0):
             self.before_wait()
             while not self.is_ended and not self._data.poll(0):
                 self._data_or_wake.poll()
-        return not self.is_ended or (self._left > 0 and bool(self._data.poll(_LAST_MS)))
+        if not self.is_ended:
+            return True
+        return self._left > 0 and bool(self._data.poll(_LAST_MS))
 
 
 class StreamReader(io.BufferedReader):
-    """Buffered reads of a stream. If the stream was ended, ``readline`` leaves out a line that is not complete."""
+    """A buffered reader of a stream.
+
+    If the stream was ended, ``readline`` leaves out an incomplete line.
+    """
 
     def __init__(self, stream: Stream) -> None:
         super().__init__(stream, HEAD)
@@ -104,20 +113,22 @@ class StreamReader(io.BufferedReader):
 
 
 def open_stream(path: Path) -> Stream | None:
-    """Open a pipe, or standard input if the path is ``-``. None for files, folders and paths that do not exist.
+    """Open a pipe, or standard input if the path is ``-``.
 
-    UserError for devices, which are not opened: one may be the port of an ESC.
+    Returns None for files, folders and paths that do not exist. Raises UserError for devices, which
+    are not opened, because a device may be the port of an ESC.
     """
     if is_standard_input(path):
         mode = os.fstat(0).st_mode
         if stat.S_ISCHR(mode) or stat.S_ISBLK(mode) or stat.S_ISDIR(mode):
             raise UserError(
-                f"{name_of(path)}: is a terminal or another device. Send the data through a pipe: COMMAND | kontronik-can-gw …"
+                f"{name_of(path)}: is a terminal or another device. "
+                "Send the data through a pipe: COMMAND | kontronik-can-gw …"
             )
         return Stream(os.dup(0), name_of(path))
     try:
         is_stream = path.exists() and not path.is_file() and not path.is_dir()
-    except OSError as error:  # a folder on the way is closed, or the name is too long
+    except OSError as error:  # a folder of the path is not accessible, or the name is too long
         raise UserError(f"{path}: cannot be opened: {error.strerror}.") from None
     if not is_stream:
         return None
@@ -132,9 +143,10 @@ def open_stream(path: Path) -> Stream | None:
 
 
 def is_standard_input(path: Path) -> bool:
+    """Return True for ``-`` and the device files of standard input."""
     return str(path) in _STANDARD_INPUT
 
 
 def name_of(path: Path) -> str:
-    """The path as messages show it."""
+    """Return the path as messages show it."""
     return "standard input" if is_standard_input(path) else str(path)

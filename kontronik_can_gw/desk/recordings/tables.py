@@ -1,4 +1,7 @@
-"""Tables as text: CSV (RFC 4180 without its carriage returns) and JSON lines; and as Parquet by pyarrow (an extra)."""
+"""Writes tables as CSV, JSON lines or Parquet.
+
+CSV follows RFC 4180 without its carriage returns. Parquet needs pyarrow, an extra.
+"""
 
 import json
 import math
@@ -6,12 +9,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC as UTC_ZONE
 from datetime import datetime
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
+from itertools import repeat
 from typing import IO, TYPE_CHECKING, Any
 
 from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
-from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock, Sample
+from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock
 from kontronik_can_gw.native import load
 from kontronik_can_gw.times import SECOND
 
@@ -19,48 +23,98 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Lines
 
 _MAX_INT64 = 1 << 63
+_KEPT_TEXTS = 1024
+"""Number of texts that are kept for each column. More would cost memory and save little time."""
 GROUP = 1 << 16
-"""Rows of a row group, whose columns stay in memory until it is full."""
+"""Number of rows in a row group. Its columns stay in memory until it is full."""
 
 
 def seconds_text(time_ns: int) -> str:
-    """Exact decimal seconds: 6 digits where that is exact, else 9."""
+    """Return exact decimal seconds: 6 decimals if they are exact, 9 decimals otherwise."""
     seconds, rest = divmod(time_ns, SECOND)
-    return f"{seconds}.{rest:09d}" if rest % 1000 else f"{seconds}.{rest // 1000:06d}"
+    if rest % 1000:
+        return f"{seconds}.{rest:09d}"
+    return f"{seconds}.{rest // 1000:06d}"
 
 
 def utc_text(wall_ns: int) -> str:
-    """ISO 8601 with microseconds: ``2023-11-14T22:13:20.123456Z``."""
+    """Return a time as ISO 8601 with microseconds: ``2023-11-14T22:13:20.123456Z``."""
     second, rest = divmod(wall_ns, SECOND)
+    return f"{_second_text(second)}.{rest // 1000:06d}Z"
+
+
+@lru_cache
+def _second_text(second: int) -> str:
     moment = datetime.fromtimestamp(second, UTC_ZONE)
-    return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1000:06d}Z"
+    return f"{moment:%Y-%m-%dT%H:%M:%S}"
 
 
 def csv_text(text: str) -> str:
-    """Quoted where it has to be."""
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in '",\r\n') else text
+    """Return a text as CSV, in quotes if it needs them."""
+    if not any(character in text for character in '",\r\n'):
+        return text
+    doubled = text.replace('"', '""')
+    return f'"{doubled}"'
+
+
+class _Texts(dict[Any, str]):
+    """The texts of a column's cells, by value. All values have the same type.
+
+    Texts that were used are kept.
+    """
+
+    def __init__(self, prefix: str, text_of: Callable[[Any], str]) -> None:
+        super().__init__()
+        self._prefix = prefix
+        self._text_of = text_of
+
+    def __missing__(self, value: Any) -> str:
+        text = self._prefix + self._text_of(value)
+        # 0.0 is equal to -0.0, which has another text
+        is_float_zero = value == 0 and isinstance(value, float)
+        if not is_float_zero:
+            if len(self) >= _KEPT_TEXTS:
+                self.clear()
+            self[value] = text
+        return text
 
 
 class TextTable:
-    """A row each line: ``start``, the time, ``utc`` and the Unix time, each cell after its prefix, ``end``. ``nothing``: not available.
+    """A table with one row in a line.
 
-    CSV has a header of names with units, JSON an object a line, with the names of the fields as keys.
+    CSV has a header of names with units. JSON has an object in each line, whose keys are the names
+    of the fields. In both, a line has these pieces: start, time, Unix time, the cells after their
+    prefixes, end.
     """
 
     def __init__(self, file: IO[bytes], table: Table, is_json: bool) -> None:
-        self._file, self._table = file, table
+        self._file = file
+        self._table = table
         self._text: Callable[[str], str] = csv_text
+        self._start = ""
+        self._utc = ","
+        """Text before the Unix time."""
+        self._utc_end = ""
+        """Text after the Unix time."""
+        self._end = "\n"
+        self._nothing = ""
+        """Cell of a value that is not available."""
+        self._prefixes = [","] * len(table.fields)
         if is_json:
             self._text = partial(json.dumps, ensure_ascii=False)
-            self._start, self._utc, self._utc_end = f'{{"{TIME}": ', f', "{UTC}": "', '"'
-            self._end, self._nothing = "}\n", "null"
+            self._start = f'{{"{TIME}": '
+            self._utc = f', "{UTC}": "'
+            self._utc_end = '"'
+            self._end = "}\n"
+            self._nothing = "null"
             self._prefixes = [f", {json.dumps(one.name)}: " for one in table.fields]
             return
-        self._start, self._utc, self._utc_end, self._end, self._nothing = "", ",", "", "\n", ""
-        self._prefixes = [","] * len(table.fields)
-        heads = [f"{TIME} [s]", *([UTC] if table.has_utc else [])]
+        heads = [f"{TIME} [s]"]
+        if table.has_utc:
+            heads.append(UTC)
         heads += [one.header for one in table.fields]
-        file.write((",".join(map(csv_text, heads)) + "\n").encode())
+        line = ",".join(map(csv_text, heads)) + "\n"
+        file.write(line.encode())
 
     def write(self, block: Block) -> None:
         """Add rows."""
@@ -68,59 +122,73 @@ class TextTable:
         if not isinstance(block, PlayedBlock) or block.times[0] + wall_ns < 0:
             self._write(block)
             return
-        begin, end, origin_ns = block.begin, block.end, self._table.origin_ns
-        for made in self._lines.of(block.made, begin, end, origin_ns, wall_ns):
-            if isinstance(made, int):
-                self._write(block.part(made - begin, made - begin + 1))
+        begin = block.begin
+        origin_ns = self._table.origin_ns
+        for piece in self._lines.of(block.made, begin, block.end, origin_ns, wall_ns):
+            if isinstance(piece, int):  # the number of a row that C cannot write
+                row = piece - begin
+                self._write(block.part(row, row + 1))
             else:
-                self._file.write(made)
+                self._file.write(piece)
 
     def _write(self, block: Block) -> None:
-        lines = (self._line(row, block.wall_ns) for row in block.rows())
+        heads = map(self._head_of_line, block.times, repeat(block.wall_ns or 0))
+        cells = [
+            map(texts.__getitem__, column)
+            for texts, column in zip(self._texts, block.columns, strict=True)
+        ]
+        lines = map("".join, zip(heads, *cells, repeat(self._end)))
         self._file.write("".join(lines).encode())
 
-    def _line(self, row: Sample, wall_ns: int | None) -> str:
-        pieces = [self._start, seconds_text(row.time_ns - self._table.origin_ns)]
+    def _head_of_line(self, time_ns: int, wall_ns: int) -> str:
+        text = self._start + seconds_text(time_ns - self._table.origin_ns)
         if self._table.has_utc:
-            pieces += (self._utc, utc_text(row.time_ns + (wall_ns or 0)), self._utc_end)
-        for prefix, value in zip(self._prefixes, row.values, strict=True):
-            pieces.append(prefix)
-            if isinstance(value, str):
-                pieces.append(self._text(value))
-            else:  # a float signal may be infinite, which JSON does not know
-                missing = value is None or not math.isfinite(value)
-                pieces.append(self._nothing if missing else str(value))
-        return "".join((*pieces, self._end))
+            text += self._utc + utc_text(time_ns + wall_ns) + self._utc_end
+        return text
+
+    @cached_property
+    def _texts(self) -> "list[_Texts]":
+        """The texts of the cells with their prefixes, for each column."""
+        return [_Texts(prefix, self._cell) for prefix in self._prefixes]
+
+    def _cell(self, value: Any) -> str:
+        if isinstance(value, str):
+            return self._text(value)
+        # a float signal may be infinite, but JSON has no infinite numbers
+        is_missing = value is None or not math.isfinite(value)
+        return self._nothing if is_missing else str(value)
 
     @cached_property
     def _lines(self) -> "Lines":
-        """The same by the core in C."""
+        """Makes the same lines in C."""
         from kontronik_can_gw.native.offline import Lines, Style
 
-        parts = (self._start, self._utc, self._utc_end, self._end, self._nothing)
-        start, utc, *rest = (part.encode() for part in parts)
-        style = Style(start, utc if self._table.has_utc else None, *rest)
-        cells = [
-            (
-                prefix.encode(),
-                [(number, self._text(text).encode()) for number, text in one.texts]
-                if one.kind is Kind.TEXT
-                else None,
-            )
-            for prefix, one in zip(self._prefixes, self._table.fields, strict=True)
-        ]
+        style = Style(
+            self._start.encode(),
+            self._utc.encode() if self._table.has_utc else None,
+            self._utc_end.encode(),
+            self._end.encode(),
+            self._nothing.encode(),
+        )
+        cells = []
+        for prefix, one in zip(self._prefixes, self._table.fields, strict=True):
+            texts = None
+            if one.kind is Kind.TEXT:
+                texts = [(number, self._text(text).encode()) for number, text in one.texts]
+            cells.append((prefix.encode(), texts))
         return Lines(load.library()[0], style, cells)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing, because no rows are held back."""
 
     discard = close
 
 
 class ParquetTable:
-    """Columns as in CSV, typed, with units and provenance in the metadata.
+    """A Parquet file with the columns of the CSV, and units and provenance as metadata.
 
-    Flags int8, whole numbers int64 (uint64 where they need it), others float64, texts dictionaries of strings; null where not available.
+    Flags are int8, whole numbers int64 (uint64 if needed), other numbers float64, and texts
+    dictionaries of strings. Null means not available.
     """
 
     def __init__(self, file: IO[bytes], table: Table) -> None:
@@ -139,7 +207,7 @@ class ParquetTable:
             )
             for one in table.fields
         ]
-        """Of a column of texts: its numbers, and the text of each."""
+        """Numbers and texts of each column of texts."""
         heads = [pa.field(f"{TIME} [s]", pa.float64(), metadata={"unit": "s"})]
         if table.has_utc:
             heads.append(pa.field(UTC, pa.timestamp("ns", tz="UTC")))
@@ -153,21 +221,25 @@ class ParquetTable:
         ]
         provenance = json.dumps(dict(table.provenance), ensure_ascii=False)
         self._schema = pa.schema(heads, metadata={"kontronik_can_gw": provenance})
-        # a dictionary costs more than it saves where every value is another one, or takes one byte
-        plain = [f"{TIME} [s]", *(one.header for one in table.fields if one.kind is Kind.FLAG)]
+        # a dictionary costs more than it saves if all values differ, or if a value takes one byte
+        plain = {one.header for one in table.fields if one.kind is Kind.FLAG}
+        plain.add(f"{TIME} [s]")
+        names = self._schema.names
         self._writer: Any = parquet.ParquetWriter(
             file,
             self._schema,
-            use_dictionary=[name for name in self._schema.names if name not in plain],
-            memory_pool=pa.system_memory_pool(),  # the others keep what they were given once
-            write_statistics=[name for name in (f"{TIME} [s]", UTC) if name in self._schema.names],
+            use_dictionary=[name for name in names if name not in plain],
+            memory_pool=pa.system_memory_pool(),  # other pools never return memory
+            write_statistics=[name for name in (f"{TIME} [s]", UTC) if name in names],
         )
         self._batches: list[Any] = []
         self._held = 0
 
     def write(self, block: Block) -> None:
         """Add rows."""
-        pa, compute, wall_ns = self._pa, self._compute, block.wall_ns or 0
+        pa = self._pa
+        compute = self._compute
+        wall_ns = block.wall_ns or 0
         if isinstance(block, PlayedBlock):
             buffers = [None, pa.py_buffer(block.times)]
             times = pa.Array.from_buffers(pa.int64(), len(block), buffers)
@@ -178,19 +250,19 @@ class ParquetTable:
         if self._table.has_utc:
             wall = compute.add(times, wall_ns)
             arrays.append(wall.cast(pa.timestamp("ns", tz="UTC")))
-        arrays += [
-            self._played(block, index, one)
-            if isinstance(block, PlayedBlock)
-            else pa.array(block.columns[index], self._type(one))
-            for index, one in enumerate(self._table.fields)
-        ]
+        for index, one in enumerate(self._table.fields):
+            if isinstance(block, PlayedBlock):
+                array = self._played(block, index, one)
+            else:
+                array = pa.array(block.columns[index], self._type(one))
+            arrays.append(array)
         self._batches.append(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
         self._held += len(block)
         if self._held >= GROUP:
             self._write_group()
 
     def close(self) -> None:
-        """Write the rest and the end."""
+        """Write the remaining rows and the end of the file."""
         self._write_group()
         self._writer.close()
 
@@ -200,11 +272,12 @@ class ParquetTable:
             self._writer.close()
 
     def _played(self, block: PlayedBlock, index: int, one: Field) -> Any:
-        """A column of the core in C, as it is."""
-        pa, made, begin, end = self._pa, block.made, block.begin, block.end
+        """Return a column of the C core without copying it."""
+        pa = self._pa
+        made = block.made
         kind = pa.float64() if made.is_real[index] else pa.int64()
         buffers = [pa.py_buffer(made.valid[index]), pa.py_buffer(made.values(index))]
-        found = pa.Array.from_buffers(kind, end, buffers)[begin:]
+        found = pa.Array.from_buffers(kind, block.end, buffers)[block.begin :]
         if one.kind is Kind.FLAG:
             return found.cast(pa.int8(), safe=False)
         if one.kind is not Kind.TEXT:
@@ -215,12 +288,16 @@ class ParquetTable:
     def _write_group(self) -> None:
         if self._batches:
             table = self._pa.Table.from_batches(self._batches, self._schema)
-            self._batches, self._held = [], 0
+            self._batches = []
+            self._held = 0
             self._writer.write_table(table.unify_dictionaries(), GROUP)
 
     def _type(self, one: Field) -> Any:
         pa = self._pa
         if one.kind is Kind.TEXT:
             return pa.dictionary(pa.int32(), pa.string())
-        whole = pa.uint64() if _MAX_INT64 <= one.high <= 2 * _MAX_INT64 else pa.int64()
-        return {Kind.FLAG: pa.int8(), Kind.WHOLE: whole, Kind.FLOAT: pa.float64()}[one.kind]
+        if one.kind is Kind.FLAG:
+            return pa.int8()
+        if one.kind is Kind.FLOAT:
+            return pa.float64()
+        return pa.uint64() if _MAX_INT64 <= one.high <= 2 * _MAX_INT64 else pa.int64()

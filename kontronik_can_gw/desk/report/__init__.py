@@ -1,1 +1,4 @@
-"""A recorded flight as an HTML page: ``flight`` and ``esc`` turn rows into numbers, events and points, which ``page`` renders."""
+"""Makes an HTML page of a recorded flight.
+
+``flight`` and ``esc`` turn rows into numbers, events and points, which ``page`` renders.
+"""

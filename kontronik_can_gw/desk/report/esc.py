@@ -1,12 +1,16 @@
-"""One ESC of a flight, found in columns of values chunk by chunk: sums, extremes and events.
+"""Computes sums, extremes and events of one ESC in a flight from columns of values.
 
-A value holds until the next row; while telemetry is lost nothing is counted. Times are ns of the recording's clock.
+A value is valid until the next row. Nothing is counted while telemetry is lost. Times are ns of the
+recording's clock.
 """
 
+import itertools
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise, repeat
+from functools import lru_cache
+from itertools import compress, repeat
 from math import isfinite
+from operator import ne
 from typing import Any, Literal, NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
@@ -26,20 +30,20 @@ from kontronik_can_gw.times import SECOND
 
 HOUR_NS = 3600 * SECOND
 REST_CURRENT = 1.0
-"""A: up to this magnitude the battery is at rest."""
+"""A. The battery is at rest up to this magnitude."""
 LOAD_CURRENT = 5.0
-"""A: at or above it the battery is under load."""
+"""A. The battery is under load at or above this current."""
 LIVE = ("battery_voltage", *SPEEDS, "battery_current", "operating_state_raw", "operating_state")
-"""The first of these that there is says whether there is telemetry."""
+"""The first of these in the recording shows whether telemetry is present."""
 DEVICE = ("device", "device_raw", "variant", "firmware_main", "firmware_sub")
 _WORD_BITS = 32
 
 Columns = dict[str, Sequence[Any]]
-"""Values of the rows of a chunk by source; None where not available."""
+"""Values of the rows of a chunk by source. None: not available."""
 Number = int | float | None
 EventKind = Literal["error", "state", "link", "device"]
 MAX_EVENTS = 5000
-"""Limit for each kind of event: more are only counted."""
+"""Number of events of each kind that are kept. Further events are only counted."""
 
 
 class Extreme(NamedTuple):
@@ -51,7 +55,7 @@ class Extreme(NamedTuple):
 
 @dataclass(slots=True)
 class Event:
-    """An event of an ESC. ``end_ns`` None: it lasts until the end; equal to ``begin_ns``: it has no length."""
+    """An event of an ESC."""
 
     kind: EventKind
     esc: int
@@ -60,14 +64,15 @@ class Event:
     severity: str = "status"
     remedy: str = ""
     end_ns: int | None = None
+    """None if the event lasts until the end. Equal to ``begin_ns`` if it has no duration."""
     note: str = ""
-    """How it ended, where that is not obvious."""
+    """A remark about its end, if the end is not obvious."""
     phase: int | None = None
-    """Of an operating state: index in PHASES."""
+    """Index in PHASES of an operating state. None for other events."""
 
 
 class Events:
-    """Events of all ESCs. One that lasts is open under a key."""
+    """The events of all ESCs. An event that lasts is stored under a key until it is ended."""
 
     def __init__(self) -> None:
         self._kept: dict[EventKind, list[Event]] = {
@@ -80,7 +85,7 @@ class Events:
         self.left_out = 0
 
     def begin(self, key: Hashable, event: Event) -> None:
-        """Add an event that lasts until its key is ended."""
+        """Add an event that lasts until ``end`` is called with its key."""
         self._open[key] = event
         if len(self._kept[event.kind]) < MAX_EVENTS:
             self._kept[event.kind].append(event)
@@ -88,136 +93,163 @@ class Events:
             self.left_out += 1
 
     def end(self, key: Hashable, time_ns: int, *, lost: bool = False) -> None:
-        """End an event, if it is open. ``lost``: telemetry was lost; what it says may continue."""
+        """End an event, if there is one under the key.
+
+        ``lost``: the cause is a loss of telemetry, so the condition itself may continue.
+        """
         event = self._open.pop(key, None)
         if event is not None:
             event.end_ns = time_ns
             event.note = "until telemetry was lost" if lost else ""
 
     def in_order(self) -> list[Event]:
-        """All events by their begin."""
-        every = [event for kept in self._kept.values() for event in kept]
+        """Return all events, sorted by their begin."""
+        every = itertools.chain.from_iterable(self._kept.values())
         return sorted(every, key=lambda event: (event.begin_ns, event.esc))
 
 
 class EscFlight:
-    """What is known of one ESC. None: not in the recording."""
+    """The results of one ESC. A number is None if the recording does not have it."""
 
     def __init__(
         self, index: int, settings: EscSettings, fields: Sequence[Field], events: Events
     ) -> None:
         self.name = settings.name
-        self.telemetry_ns = self.turning_ns = 0
-        """Time with telemetry, and with the motor turning."""
+        self.telemetry_ns = 0
+        """Time with telemetry."""
+        self.turning_ns = 0
+        """Time during which the motor turned."""
         self.counted: dict[str, float] = {}
-        """By source: what a counter went up by."""
+        """Increase of each counter, by source."""
         self.extremes: dict[str, Extreme] = {}
-        """By source."""
+        """Maximum or minimum, by source."""
         self.cells = settings.cell_count or None
         self.rest_voltage: float | None = None
-        """V of the battery before the first load."""
+        """Battery voltage in V before the first load."""
         self.load_voltage: Extreme | None = None
-        """V of the battery, minimum under load."""
+        """Lowest battery voltage in V under load."""
         self.gaps = 0
         self.devices: list[str] = []
-        """Every device seen, in words; usually one."""
-        self._index, self._events, self._protocol = index, events, protocol_named(settings.protocol)
-        self._at = at = {f.source: i for i, f in reversed([*enumerate(fields)]) if f.esc == index}
-        self.computed = _values_to_compute([fields[place] for place in at.values()])
-        """Values that the recording has, but less often than the values from which they follow."""
-        self._floats = {f.source for f in fields if f.signal and f.kind is Kind.FLOAT}
-        """Values of CAN frames, which may be infinite: that is no value."""
-        self._live = next((source for source in LIVE if source in at), None)
-        self._words: list[tuple[str, str, Iterable[int], int]] = []
-        """Error words and flags: source, word, bits in it, and by how much its value is shifted."""
-        for word, bits in self._protocol.errors.items():
-            flags = [(bit.text, word, (int(bit),), int(bit)) for bit in bits if bit.text in at]
-            self._words += [(word, word, range(_WORD_BITS), 0)] if word in at else flags
-        known = set(at)
-        if "battery_voltage" in at:
-            known.add("mean_cell_voltage")
-            if "battery_current" in at:
-                known.add("battery_power")
+        """Descriptions of all devices that were seen, usually one."""
+        self._index = index
+        self._events = events
+        self._protocol = protocol_named(settings.protocol)
+        self._columns = _first_fields(fields, index)
+        self.computed = _values_to_compute([fields[place] for place in self._columns.values()])
+        """Values that the recording has less often than the values from which they follow."""
+        self._floats = {
+            field.source for field in fields if field.signal and field.kind is Kind.FLOAT
+        }
+        """Values in CAN frames that may be infinite, which means not available."""
+        self._live = next((source for source in LIVE if source in self._columns), None)
+        self._words = self._error_words()
+        known = self._known_sources()
         self.drawn = [source for source in DRAWN if source in known]
-        self.has_errors, self.has_power = bool(self._words), "battery_power" in known
+        self.has_errors = bool(self._words)
+        self.has_power = "battery_power" in known
         self.has_speed = not known.isdisjoint(SPEEDS)
         self._names = {normalize(state.text): state for state in self._protocol.states.values()}
         self._last: dict[str, Any] = {"gap": True}
+        """The last value of each column whose changes are followed."""
         self._counts: dict[str, float] = {}
+        """The last value of each counter."""
         self._set: set[tuple[int, str, int]] = set()
+        """Keys of the error bits that are set."""
         self._held: tuple[int, bool, float, Number] = (0, False, 0, 0)
         """Time, presence of telemetry, power and speed of the last row."""
         self._energy = 0.0  # W ns
 
     @property
     def energy_wh(self) -> float | None:
-        """Wh, the integral of the positive power."""
+        """The integral of the positive power in Wh."""
         return self._energy / HOUR_NS if self.has_power else None
 
     def take(
         self, times: Sequence[int], chunk: Sequence[Sequence[Any]]
     ) -> list[Sequence[int | float | None]]:
-        """Take rows as columns; return those to draw."""
-        columns = {source: chunk[at] for source, at in self._at.items()}
+        """Evaluate rows that are given as columns. Return the columns to draw."""
+        columns = {source: chunk[place] for source, place in self._columns.items()}
         for source in columns.keys() & self._floats:
-            columns[source] = [v if v is None or isfinite(v) else None for v in columns[source]]
+            columns[source] = _finite(columns[source])
         self._derive(columns)
         nothing = (None,) * len(times)
         present = nothing if self._live is None else columns[self._live]
-        for row, is_lost in self._changes("gap", [value is None for value in present]):
-            self._events.end((self._index, "gap"), times[row])
-            if is_lost:
-                self.gaps += 1
-                event = Event("link", self._index, times[row], "No telemetry", "warning")
-                self._events.begin((self._index, "gap"), event)
+        self._find_gaps(times, present)
         parts = [columns.get(source, nothing) for source in DEVICE]
-        for row, about in self._changes("device", [*zip(*parts, strict=True)]):
+        devices = [*zip(*parts, strict=True)]
+        for row, about in self._changes("device", devices):
             self._name_device(times[row], *about)
-        for row, state in self._changes("state", columns.get(_state_of(columns), ())):
+        states = columns.get(_state_of(columns), ())
+        for row, state in self._changes("state", states):
             self._change_state(times[row], state)
         for source, word, bits, shift in self._words:
             for row, value in self._changes(source, columns[source]):
                 is_lost = value is None or present[row] is None
+                word_value = int(value or 0) << shift
                 for bit in bits:
-                    is_set = (int(value or 0) << shift) >> bit & 1
+                    is_set = word_value >> bit & 1
                     self._change_bit(times[row], word, bit, is_set, is_lost)
         self._count(columns)
         self._find_extremes(times, columns)
         self._add_up(times, present, columns)
         return [columns[source] for source in self.drawn]
 
+    def _known_sources(self) -> set[str]:
+        """Return the sources in the recording, and those that can be computed from them."""
+        known = set(self._columns)
+        if "battery_voltage" in known:
+            known.add("mean_cell_voltage")
+            if "battery_current" in known:
+                known.add("battery_power")
+        return known
+
+    def _error_words(self) -> list[tuple[str, str, Iterable[int], int]]:
+        """Return the columns with errors: source, error word, bits, and left shift of the value.
+
+        A column is a whole error word, or a flag if the recording does not have the word.
+        """
+        found: list[tuple[str, str, Iterable[int], int]] = []
+        for word, bits in self._protocol.errors.items():
+            if word in self._columns:
+                found.append((word, word, range(_WORD_BITS), 0))
+                continue
+            for bit in bits:
+                if bit.text in self._columns:
+                    found.append((bit.text, word, (int(bit),), int(bit)))
+        return found
+
     def _changes(self, key: str, values: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-        """Row and new value of each change of a column, over all chunks."""
+        """Yield row and new value of each change of a column, also between chunks."""
         last = self._last.get(key)
-        for row, value in enumerate(values if values.count(last) != len(values) else ()):
+        if values.count(last) == len(values):
+            return
+        for row, value in enumerate(values):
             if value != last:
-                last = self._last[key] = value
+                last = value
+                self._last[key] = value
                 yield row, value
 
     def _derive(self, columns: Columns) -> None:
-        """Add values that follow from others, if the recording lacks them or has them less often."""
-        voltage, current = columns.get("battery_voltage"), columns.get("battery_current")
+        """Add values that follow from others, if they are missing or less frequent."""
+        voltage = columns.get("battery_voltage")
+        current = columns.get("battery_current")
         cells = self._cells_of_rows(columns.get("cell_count", ()))
         if voltage is None:
             return
         if self._is_computed("mean_cell_voltage", columns):
             sent = columns.get("mean_cell_voltage", repeat(None))
-            columns["mean_cell_voltage"] = [
-                _mean_cell(*of_row) for of_row in zip(voltage, cells, sent, strict=False)
-            ]
+            columns["mean_cell_voltage"] = [*map(_mean_cell, voltage, cells, sent)]
         if current is not None and self._is_computed("battery_power", columns):
-            columns["battery_power"] = [
-                None if v is None or i is None else round(v * i, 3)
-                for v, i in zip(voltage, current, strict=True)
-            ]
+            columns["battery_power"] = [*map(_power, voltage, current)]
 
     def _cells_of_rows(self, counts: Sequence[Any]) -> Iterable[int | None]:
-        """The number of cells as it is known at each row."""
+        """Return the known number of cells at each row."""
         if counts.count(self.cells) == len(counts):
             return repeat(self.cells)
         found = []
         for count in counts:
-            self.cells = round(count) if count else self.cells
+            if count:
+                self.cells = round(count)
             found.append(self.cells)
         return found
 
@@ -225,6 +257,16 @@ class EscFlight:
         return source in self.computed or source not in columns
 
     # --- events
+
+    def _find_gaps(self, times: Sequence[int], present: Sequence[Any]) -> None:
+        """Begin and end the events of lost telemetry."""
+        key = (self._index, "gap")
+        for row, is_lost in self._changes("gap", [value is None for value in present]):
+            self._events.end(key, times[row])
+            if is_lost:
+                self.gaps += 1
+                event = Event("link", self._index, times[row], "No telemetry", "warning")
+                self._events.begin(key, event)
 
     def _name_device(self, now: int, device: Any, raw: Any, variant: Any, *version: Any) -> None:
         if device is None and raw is not None:
@@ -236,10 +278,10 @@ class EscFlight:
             text += ", firmware {}.{}".format(*version)
         if text not in self.devices[-1:]:
             if self.devices:
+                key = (self._index, "device")
                 change = f"Device changed from {self.devices[-1]} to {text}"
-                event = Event("device", self._index, now, change)
-                self._events.begin((self._index, "device"), event)
-                self._events.end((self._index, "device"), now)
+                self._events.begin(key, Event("device", self._index, now, change))
+                self._events.end(key, now)
             self.devices.append(text)
 
     def _change_state(self, now: int, value: Any) -> None:
@@ -251,8 +293,12 @@ class EscFlight:
             state = self._names.get(normalize(value))
         else:
             state = self._protocol.states.get(value)
-        phase = PHASES[-1] if state is None or state.phase not in PHASES else state.phase
-        text = f"state {value}" if state is None else state.text
+        phase = PHASES[-1]
+        text = f"state {value}"
+        if state is not None:
+            text = state.text
+            if state.phase in PHASES:
+                phase = state.phase
         severity = "error" if phase == "Fault" else "status"
         event = Event("state", self._index, now, text, severity, phase=PHASES.index(phase))
         self._events.begin(key, event)
@@ -269,7 +315,8 @@ class EscFlight:
                 if known.is_normal:
                     return
                 place = "self-test: " if word == "selftest_errors" else ""
-                event.text, event.severity = place + known.meaning, known.severity.value
+                event.text = place + known.meaning
+                event.severity = known.severity.value
                 event.remedy = known.remedy
             self._set.add(key)
             self._events.begin(key, event)
@@ -277,42 +324,52 @@ class EscFlight:
     # --- numbers
 
     def _count(self, columns: Columns) -> None:
-        """Add what counters went up by. One that begins again, or overflows, adds its new value."""
+        """Add the increases of counters. A counter that begins again adds its new value."""
         for source in COUNTERS:
             known = [value for value in columns.get(source, ()) if value is not None]
-            if known:
-                steps = pairwise((self._counts.get(source, known[0]), *known))
-                more = sum(b - a if b >= a else b for a, b in steps)
-                self.counted[source] = self.counted.get(source, 0) + more
-                self._counts[source] = known[-1]
+            if not known:
+                continue
+            last = self._counts.get(source, known[0])
+            increases = []
+            # most values are equal to the one before, and are skipped
+            for value in compress(known, map(ne, known, (last, *known))):
+                increases.append(value - last if value >= last else value)
+                last = value
+            self.counted[source] = self.counted.get(source, 0) + sum(increases)
+            self._counts[source] = last
 
     def _find_extremes(self, times: Sequence[int], columns: Columns) -> None:
         for quantities, best in ((MAXIMA, max), (MINIMA, min)):
             for source in quantities.keys() & columns.keys():
                 values = columns[source]
                 known = [v for v in values if v is not None] if None in values else values
-                value = best(known, default=None)
+                if not known:
+                    continue
+                value = best(known)
                 before = self.extremes.get(source)
-                if value is not None and (
-                    before is None or best(value, before.value) != before.value
-                ):
+                if before is None or best(value, before.value) != before.value:
                     self.extremes[source] = Extreme(value, times[values.index(value)])
 
     def _add_up(self, times: Sequence[int], present: Sequence[Any], columns: Columns) -> None:
-        """Add times and energy; weigh the battery."""
+        """Add times and energy, and find the battery's voltages at rest and under load."""
         nothing = (None,) * len(times)
-        load = [columns.get(f"battery_{name}", nothing) for name in ("power", "voltage", "current")]
+        powers = columns.get("battery_power", nothing)
+        voltages = columns.get("battery_voltage", nothing)
+        currents = columns.get("battery_current", nothing)
         speeds = next((columns[source] for source in SPEEDS if source in columns), nothing)
-        since, was_there, held_power, turned = self._held
-        for now, live, power, voltage, current, speed in zip(
-            times, present, *load, speeds, strict=True
-        ):
-            if was_there:
-                length = now - since
-                self.telemetry_ns += length
-                self.turning_ns += length if turned else 0
-                self._energy += held_power * length
-            since, was_there, held_power, turned = now, live is not None, max(power or 0, 0), speed
+        since_ns, has_telemetry, last_power, last_speed = self._held
+        rows = zip(times, present, powers, voltages, currents, speeds, strict=True)
+        for now, live, power, voltage, current, speed in rows:
+            if has_telemetry:
+                length_ns = now - since_ns
+                self.telemetry_ns += length_ns
+                if last_speed:
+                    self.turning_ns += length_ns
+                self._energy += last_power * length_ns
+            since_ns = now
+            has_telemetry = live is not None
+            last_power = max(power or 0, 0)
+            last_speed = speed
             if voltage is None or current is None:
                 continue
             if current >= LOAD_CURRENT:
@@ -320,23 +377,49 @@ class EscFlight:
                     self.load_voltage = Extreme(voltage, now)
             elif self.load_voltage is None and abs(current) <= REST_CURRENT and voltage > 0:
                 self.rest_voltage = voltage
-        self._held = since, was_there, held_power, turned
+        self._held = (since_ns, has_telemetry, last_power, last_speed)
 
 
+def _first_fields(fields: Sequence[Field], esc: int) -> dict[str, int]:
+    """Return the index of the first field of each source of an ESC."""
+    found: dict[str, int] = {}
+    for index, field in enumerate(fields):
+        if field.esc == esc:
+            found.setdefault(field.source, index)
+    return found
+
+
+def _finite(values: Sequence[Number]) -> Sequence[Number]:
+    """Return the values with None for infinite values."""
+    if isfinite(sum(filter(None, values))):
+        return values
+    return [value if value is None or isfinite(value) else None for value in values]
+
+
+@lru_cache(4096)
 def _mean_cell(voltage: Number, cells: int | None, sent: Number) -> Number:
+    """Return the mean cell voltage, or the sent value if the number of cells is unknown."""
     if voltage is None:
         return None
     return round(voltage / cells, 3) if cells else sent
 
 
+def _power(voltage: Number, current: Number) -> Number:
+    if voltage is None or current is None:
+        return None
+    return round(voltage * current, 3)
+
+
 def _values_to_compute(fields: Sequence[Field]) -> set[str]:
-    """Values in CAN frames that are sent less often than all values from which they follow."""
+    """Return the values in CAN frames that are less frequent than the values they follow from."""
     periods = {field.source: field.period_ns for field in fields}
     found = set()
     for source, parts in COMPUTED_FROM.items():
         own = periods.get(source)
-        of_parts = [periods.get(part) for part in parts]
-        if own is not None and all(period is not None and period < own for period in of_parts):
+        if own is None:
+            continue
+        part_periods = [periods.get(part) for part in parts]
+        if all(period is not None and period < own for period in part_periods):
             found.add(source)
     return found
 

@@ -1,11 +1,13 @@
-"""A recorded flight: rows of values in; numbers, events and points to draw out. Pure, one pass, bounded memory.
+"""Evaluates a recorded flight: turns rows of values into numbers, events and points to draw.
 
-Every value is found by its name, so any recording and any DBC will do; what they do not have is left out. Two rows further apart than the
-time-out have a gap between them. Times are ns of the recording's clock.
+Pure functions of the rows, in one pass, with bounded memory. Values are found by name, so any
+recording and any DBC can be used. Missing values are left out. If two rows are further apart than
+the time-out, there is a gap between them. Times are ns of the recording's clock.
 """
 
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
+from itertools import compress, islice, pairwise
+from operator import ne
 from typing import NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import Field, column_of
@@ -19,32 +21,60 @@ from kontronik_can_gw.status import GatewayState
 from kontronik_can_gw.times import MS, SECOND
 
 LONGEST_GAP_NS = 86_400 * SECOND
-"""Longer gaps are cut out: the clock was set forward, or the recording holds runs of different days."""
+"""Longer gaps are cut out.
+
+Their cause is a clock that was set forward, or a recording with runs of different days.
+"""
 _GAP_LEFT_NS = 2 * SECOND
-"""What is left of them, beside the length from which a gap is one."""
+"""Length of a shortened gap, in addition to the shortest length of a gap."""
 SAME_SPEED = 0.005
-"""Share that the maxima of equal speeds may differ by: in a CAN log they come in different messages."""
-_ERRORS = {name for each in PROTOCOLS for name in (*each.errors, *each.bits)}
-_SOURCES = {*DRAWN, *COUNTERS, *LIVE, *MAXIMA, *MINIMA, *DEVICE, *_ERRORS}
-_SOURCES |= {"cell_count", "gateway_state"}
+"""Share by which the maxima of equal speeds may differ.
+
+They differ in a CAN log, because the speeds are in different messages.
+"""
+_SOURCES = {
+    *DRAWN,
+    *COUNTERS,
+    *LIVE,
+    *MAXIMA,
+    *MINIMA,
+    *DEVICE,
+    "cell_count",
+    "gateway_state",
+}
+"""Names of the values that a flight needs, with the errors of all protocols."""
+for _protocol in PROTOCOLS:
+    _SOURCES.update(_protocol.errors, _protocol.bits)
 
 
 def needed_columns(fields: Sequence[Field]) -> list[int]:
-    """The fields of a recording that a flight needs: of error words and their flags the words."""
-    words = {field.source for field in fields} & {word for p in PROTOCOLS for word in p.errors}
-    flags = {bit.text for p in PROTOCOLS for word in words for bit in p.errors.get(word, ())}
-    return [i for i, field in enumerate(fields) if field.source in _SOURCES - flags]
+    """Return the indices of the fields that a flight needs.
+
+    Flags are not needed if the recording has the error word that contains them.
+    """
+    present = {field.source for field in fields}
+    needed = set(_SOURCES)
+    for protocol in PROTOCOLS:
+        for word, bits in protocol.errors.items():
+            if word in present:
+                needed -= {bit.text for bit in bits}
+    return [index for index, field in enumerate(fields) if field.source in needed]
 
 
 class Cut(NamedTuple):
-    """A long gap that was cut out. ``begin_ns``: the time of the row in front of it; ``length_ns``: how much is left out."""
+    """A long gap that was cut out."""
 
     begin_ns: int
+    """Time of the row before the gap."""
     length_ns: int
+    """Length of the part that is left out."""
 
 
 class Flight:
-    """Takes the rows of a recording in blocks. ``window``: seconds after the first row, (from, to); None: no limit."""
+    """Evaluates the rows of a recording, which are given in blocks.
+
+    ``window``: first and last time in seconds after the first row. None means no limit.
+    """
 
     def __init__(
         self,
@@ -56,26 +86,38 @@ class Flight:
         low, high = window
         self._from_ns = 0 if low is None else round(low * SECOND)
         self._to_ns = None if high is None else round(high * SECOND)
-        self._gap_ns = max(500 * MS, *(settings.timeout_ns + 250 * MS for settings in escs))
+        timeouts = [settings.timeout_ns for settings in escs]
+        self._gap_ns = max(500 * MS, max(timeouts) + 250 * MS)
+        """Two rows further apart than this have a gap between them."""
         self._blank = ((None,),) * len(fields)
         self._gateway_state = column_of(fields, "gateway_state", None)
         self.seen = Events()
         self._has_begun = False
-        self.origin_ns = self.start_ns = self.end_ns = 0
-        """Times of the recording's first row (time 0 of the page), and of the window's first and last, without long gaps."""
+        self.origin_ns = 0
+        """Time of the recording's first row, which is time 0 of the page."""
+        self.start_ns = 0
+        """Time of the window's first row, without long gaps."""
+        self.end_ns = 0
+        """Time of the window's last row, without long gaps."""
         self.cuts: list[Cut] = []
         """Long gaps, which are cut out of all times."""
-        self._cut_ns = self._last_ns = 0
+        self._cut_ns = 0
+        """Total length of the cuts."""
+        self._last_ns = 0
+        """Time of the last row in the recording."""
         self.rows = 0
         self.replayed = False
         self.escs = [EscFlight(i, each, fields, self.seen) for i, each in enumerate(escs)]
-        self._drawn = [(i, source) for i, esc in enumerate(self.escs) for source in esc.drawn]
+        self._drawn: list[tuple[int, str]] = []
+        """ESC and source of each line."""
+        for index, esc in enumerate(self.escs):
+            self._drawn += [(index, source) for source in esc.drawn]
         self.points = Decimator(len(self._drawn), points)
         """Times and columns of all lines."""
         self.lines: dict[tuple[int, str], list[Number]] = {}
-        """After ``finish``: the points to draw, by ESC and source."""
+        """The points to draw, by ESC and source. Complete after ``finish``."""
         self.events: list[Event] = []
-        """After ``finish``: all events by their begin."""
+        """All events, sorted by their begin. Complete after ``finish``."""
 
     @property
     def has_anything(self) -> bool:
@@ -83,10 +125,11 @@ class Flight:
         return bool(self._drawn)
 
     def take(self, block: Block) -> bool:
-        """Take rows; False where all that follow are after the window."""
+        """Evaluate rows. Return False if all later rows are after the window."""
         if not self._has_begun:
             self._has_begun = True
-            self.origin_ns = self._last_ns = block.times[0]
+            self.origin_ns = block.times[0]
+            self._last_ns = block.times[0]
         block = self._without_long_gaps(block)
         high = LATEST_NS if self._to_ns is None else self.origin_ns + self._to_ns
         rows = block.between(self.origin_ns + self._from_ns, high)
@@ -104,9 +147,10 @@ class Flight:
         return block.times[-1] <= high
 
     def _without_long_gaps(self, block: Block) -> Block:
-        """The rows with their times on the page."""
+        """Return the rows with their times on the page."""
         times: Sequence[int] = block.times
-        last_ns, self._last_ns = self._last_ns, times[-1]
+        last_ns = self._last_ns
+        self._last_ns = times[-1]
         if times[-1] - last_ns <= LONGEST_GAP_NS and not self._cut_ns:
             return block
         moved = []
@@ -120,107 +164,146 @@ class Flight:
         return Block(moved, block.columns, None)
 
     def finish(self) -> "Flight":
-        """Have ``lines`` and ``events`` made after the last row."""
-        lines = zip(self._drawn, self.points.columns, strict=True)
-        self.lines = {key: line for key, line in lines if line.count(None) < len(line)}
+        """Make ``lines`` and ``events``. Must be called after the last row."""
+        for key, line in zip(self._drawn, self.points.columns, strict=True):
+            if line.count(None) < len(line):
+                self.lines[key] = line
         for slow, fast in pairwise(("output_speed", "motor_speed", "electrical_speed")):
-            found = [esc.extremes for esc in self.escs]
-            tops = [(e[slow].value, e[fast].value) for e in found if slow in e and fast in e]
-            if tops and all(
-                abs(a - b) <= SAME_SPEED * b for a, b in tops
-            ):  # no gear, one pole pair
-                for index, extremes in enumerate(found):
+            if self._has_same_speeds(slow, fast):
+                for index, esc in enumerate(self.escs):
                     self.lines.pop((index, slow), None)
-                    extremes.pop(slow, None)
+                    esc.extremes.pop(slow, None)
         self.events = self.seen.in_order()
         return self
+
+    def _has_same_speeds(self, slow: str, fast: str) -> bool:
+        """Return True if two speeds are equal, because there is no gear or only one pole pair."""
+        has_both = False
+        for esc in self.escs:
+            if slow not in esc.extremes or fast not in esc.extremes:
+                continue
+            has_both = True
+            top = esc.extremes[fast].value
+            if abs(esc.extremes[slow].value - top) > SAME_SPEED * top:
+                return False
+        return has_both
 
     def _analyse(self, rows: Block) -> None:
         if not len(rows):
             return
-        times, columns = rows.times, rows.columns
+        times = rows.times
+        columns = rows.columns
         if self._gateway_state is not None:
-            replay = GatewayState.REPLAY
             for value in set(columns[self._gateway_state]):
-                self.replayed |= value == replay or normalize(str(value)) == normalize(replay.name)
-        drawn = [column for esc in self.escs for column in esc.take(times, columns)]
+                self.replayed |= _is_replay(value)
+        drawn: list[Sequence[Number]] = []
+        for esc in self.escs:
+            drawn += esc.take(times, columns)
         self.points.feed(times, drawn)
+
+
+def _is_replay(state: object) -> bool:
+    """Return True for the gateway's state REPLAY, as a number or a text."""
+    replay = GatewayState.REPLAY
+    return state == replay or normalize(str(state)) == normalize(replay.name)
 
 
 # --- points to draw
 
 MIN_POINTS = 8
 _MERGED = 4
-"""Points that become two; as rows they are two buckets."""
+"""Number of points that are merged into two. They come from two buckets of rows."""
 
 
 class Decimator:
-    """Reduces many rows to few points that look the same in a plot; one pass, bounded memory.
+    """Reduces many rows to few points that look the same in a plot.
 
-    Consecutive rows share a bucket, of which two points are kept: the minimum and the maximum of each column in the order in which
-    they came. When there are too many points, they are reduced again as rows were. So every extreme is kept exactly, its time to
-    within a bucket, and with no more rows than points nothing is changed. A bucket begins where a column becomes available or not
-    available, so each line ends at the last value before a gap and begins again at the first after it, even for a gap of one row.
-    ``times`` and ``columns``, of which there are ``width``, have at most ``points`` points, and a few more for each gap.
+    It needs one pass and bounded memory.
+
+    1. Consecutive rows share a bucket. Two points of it are kept: the minimum and the maximum of
+       each column, in the order of their times.
+    2. If there are too many points, they are reduced again in the same way.
+    3. So every extreme value is exact, and its time is exact to within a bucket. Nothing is changed
+       if there are at most as many rows as points.
+    4. A new bucket begins when a column becomes available or not available. So a line ends at the
+       last value before a gap and begins again at the first value after it, even if the gap has
+       only one row.
+
+    There are ``width`` columns. ``times`` and ``columns`` have at most ``points`` points, and a few
+    more for each gap.
     """
 
     def __init__(self, width: int, points: int) -> None:
         self.rows_in_bucket = 1
-        """Rows in a full bucket; 1: nothing was left out."""
+        """Number of rows in a full bucket. 1: nothing was left out."""
         self.times: list[int] = []
         self.columns: list[list[Number]] = [[] for _ in range(width)]
         self._points = max(points, MIN_POINTS)
 
     def feed(self, times: Sequence[int], columns: Sequence[Sequence[Number]]) -> None:
-        """Take rows as columns; ``times`` in ns, never falling."""
+        """Add rows that are given as columns. ``times`` are in ns and do not decrease."""
         self._append(times, columns, self.rows_in_bucket)
         while self._is_full():
-            times, columns = self.times, self.columns
-            self.times, self.columns = [], [[] for _ in columns]
+            times = self.times
+            columns = self.columns
+            self.times = []
+            self.columns = [[] for _ in columns]
             self.rows_in_bucket = max(_MERGED, 2 * self.rows_in_bucket)
             self._append(times, columns, _MERGED)
 
     def _is_full(self) -> bool:
-        if (count := len(self.times)) <= self._points:
+        count = len(self.times)
+        if count <= self._points:
             return False
-        gaps = sum(1 for _ in _runs(self.columns, count)) - 1
+        gaps = len(_runs(self.columns, count)) - 1
         return count > self._points + 2 * gaps
 
     def _append(self, times: Sequence[int], columns: Sequence[Sequence[Number]], size: int) -> None:
-        """Add rows, of each ``size`` of them two points."""
+        """Add rows. Two points are kept of each ``size`` rows."""
         for begin, end in _runs(columns, len(times)):
-            whole = end - (end - begin) % size
             if size == 1:
                 self.times += times[begin:end]
-            else:
-                for first in range(begin, end, size):
-                    past = min(first + size, end)
-                    self.times += (times[first], times[past - 1])[: past - first]
-            for points, values in zip(self.columns, columns, strict=True):
-                if size == 1:
+                for points, values in zip(self.columns, columns, strict=True):
                     points += values[begin:end]
-                    continue
-                if values[begin] is None:  # all of the run are
+                continue
+            for first in range(begin, end, size):
+                last = min(first + size, end) - 1
+                self.times.append(times[first])
+                if last > first:
+                    self.times.append(times[last])
+            for points, values in zip(self.columns, columns, strict=True):
+                if values[begin] is None:  # then all values of the run are None
                     points += [None] * (len(self.times) - len(points))
-                    continue
-                for bucket in zip(*[iter(values[begin:whole])] * size, strict=True):
-                    points += _ends_of(bucket)
-                if whole < end:
-                    points += _ends_of(values[whole:end])[: end - whole]
+                else:
+                    _append_extremes(points, values[begin:end], size)
 
 
-def _runs(columns: Sequence[Sequence[Number]], count: int) -> Iterator[tuple[int, int]]:
-    """Runs of rows in which the same columns are missing: from, to."""
+def _append_extremes(points: list[Number], values: Sequence[Number], size: int) -> None:
+    """Add minimum and maximum of each ``size`` values. The last bucket may be shorter."""
+    rest = len(values) % size
+    whole = len(values) - rest
+    iterator = iter(values[:whole])
+    for bucket in zip(*[iterator] * size, strict=True):
+        points += _extremes_of(bucket)
+    if rest:
+        points += _extremes_of(values[whole:])[:rest]
+
+
+def _runs(columns: Sequence[Sequence[Number]], count: int) -> list[tuple[int, int]]:
+    """Return begin and end of each run of rows in which the same columns are missing."""
     edges = {0, count}
     for values in columns:
         if None in values:
             missing = [value is None for value in values]
-            edges |= {at for at, (a, b) in enumerate(pairwise(missing), 1) if a is not b}
-    yield from pairwise(sorted(edges))
+            has_changed = map(ne, missing, islice(missing, 1, None))
+            edges.update(compress(range(1, count), has_changed))
+    return list(pairwise(sorted(edges)))
 
 
-def _ends_of(values: Sequence[Number]) -> tuple[Number, Number]:
-    """Minimum and maximum in the order in which they came; none of the values is None."""
+def _extremes_of(values: Sequence[Number]) -> tuple[Number, Number]:
+    """Return minimum and maximum in the order of their times. No value may be None."""
     low = min(values)  # type: ignore[type-var]
     high = max(values)  # type: ignore[type-var]
-    return (low, high) if values.index(low) <= values.index(high) else (high, low)
+    if values.index(low) <= values.index(high):
+        return low, high
+    return high, low

@@ -1,4 +1,8 @@
-"""Renders a flight as one HTML page that needs no network: template files, uPlot, and data as packed JSON. The output is deterministic."""
+"""Renders a flight as one HTML page that needs no network.
+
+The page consists of template files, uPlot, and the data as packed JSON. The output is
+deterministic.
+"""
 
 import base64
 import gzip
@@ -13,7 +17,7 @@ from typing import Any
 
 from kontronik_can_gw.desk.report.esc import Number
 from kontronik_can_gw.desk.report.flight import Flight
-from kontronik_can_gw.desk.report.quantities import PHASES, PLOTS
+from kontronik_can_gw.desk.report.quantities import PHASES, PLOTS, Plot
 from kontronik_can_gw.desk.report.summary import tables, tiles
 from kontronik_can_gw.desk.words import clock, duration, number, wall_clock
 from kontronik_can_gw.esc.values import VALUES
@@ -21,8 +25,9 @@ from kontronik_can_gw.times import SECOND
 
 HERE = Path(__file__).parent
 _MAX_CUTS = 20
+"""Number of cuts that are listed."""
 APART = 4
-"""Lines whose greatest values are further apart than this factor have a plot each."""
+"""Lines have different plots if the ratio of their greatest values exceeds this factor."""
 
 
 def render(
@@ -33,12 +38,18 @@ def render(
     wall_ns: int | None = None,
     damage: Sequence[str] = (),
 ) -> str:
-    """Render the page. ``source``: the input's name; ``wall_ns``: Unix time of the recording's time 0, None where not known."""
+    """Render the page.
+
+    ``source`` is the input's name. ``wall_ns`` is the Unix time of the recording's time 0, or None
+    if it is unknown.
+    """
     style = _file("vendor/uPlot.min.css") + _file("page.css")
-    library, script = _file("vendor/uPlot.iife.min.js"), _file("page.js")
+    library = _file("vendor/uPlot.iife.min.js")
+    script = _file("page.js")
     policy = f"default-src 'none'; script-src {_hash(library)} {_hash(script)}; "
     policy += f"style-src {_hash(style)}; base-uri 'none'; form-action 'none'"
     data = json.dumps(_data(flight, wall_ns), separators=(",", ":"), allow_nan=False)
+    packed = gzip.compress(data.encode(), mtime=0)
     parts = {
         "policy": escape(policy),
         "title": escape(source),
@@ -49,7 +60,7 @@ def render(
         "tables": tables(flight),
         "several": "groups several" if len(flight.escs) > 1 else "groups",
         "notes": _notes(flight),
-        "data": base64.b64encode(gzip.compress(data.encode(), mtime=0)).decode(),
+        "data": base64.b64encode(packed).decode(),
         "library": library,
         "script": script,
     }
@@ -61,18 +72,25 @@ def _file(name: str) -> str:
 
 
 def _hash(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
 
 
 # --- data for the script
 
 
 def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
-    """All that page.js draws; times in seconds of the recording."""
+    """Return all data that page.js draws. Times are in seconds of the recording."""
 
     def seconds(time_ns: int | None) -> float | None:
-        return None if time_ns is None else round((time_ns - flight.origin_ns) / SECOND, 6)
+        if time_ns is None:
+            return None
+        return round((time_ns - flight.origin_ns) / SECOND, 6)
 
+    events = []
+    for event in flight.events:
+        times = {"from": seconds(event.begin_ns), "to": seconds(event.end_ns)}
+        events.append(asdict(event) | times)
     return {
         "escs": [esc.name for esc in flight.escs],
         "from": seconds(flight.start_ns),
@@ -82,64 +100,72 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
         "times": [seconds(time_ns) for time_ns in flight.points.times],
         "phases": PHASES,
         "plots": list(_plots(flight)),
-        "events": [
-            {**asdict(event), "from": seconds(event.begin_ns), "to": seconds(event.end_ns)}
-            for event in flight.events
-        ],
+        "events": events,
     }
 
 
+Lines = dict[str, dict[int, list[Number]]]
+"""The points of each line, by source and ESC."""
+
+
 def _plots(flight: Flight) -> Iterator[dict[str, Any]]:
-    """The plots that have data. Lines of one plot whose sizes differ get plots of their own, unless they have one shape."""
+    """Yield the plots that have data.
+
+    If the sizes of a plot's lines differ, they are drawn in separate plots, unless they have the
+    same shape.
+    """
     for plot in PLOTS:
-        lines: dict[str, dict[int, list[Number]]] = {}
+        lines: Lines = {}
         for (esc, source), values in flight.lines.items():
             if source in plot.lines:
                 lines.setdefault(source, {})[esc] = values
-        tops = {
-            source: max(
-                abs(v) for values in lines[source].values() for v in values if v is not None
-            )
-            for source in plot.lines
-            if source in lines
-        }
-        groups = [[*tops]] if plot.has_one_shape and tops else of_like_size(tops)
+        tops = {source: _top(lines[source]) for source in plot.lines if source in lines}
+        groups = of_like_size(tops)
+        if plot.has_one_shape and tops:
+            groups = [[*tops]]
         for index, sources in enumerate(groups):
             labels = [plot.lines[source] for source in sources]
-            named = f"{', '.join(labels)} {plot.title[0].lower()}{plot.title[1:]}"
+            title = plot.title
+            if len(groups) > 1:
+                title = f"{', '.join(labels)} {plot.title[0].lower()}{plot.title[1:]}"
             yield {
                 "key": f"{plot.key}-{index}" if index else plot.key,
-                "title": named if len(groups) > 1 else plot.title,
+                "title": title,
                 "note": _note_on_shape(labels) if plot.has_one_shape else "",
                 "unit": VALUES[sources[0]].unit,
                 "digits": plot.digits,
                 "lines": labels,
-                "series": [
-                    {
-                        "esc": esc,
-                        "line": line,
-                        "values": values,
-                        "drawn": not plot.has_one_shape or line == _first_line(lines, sources, esc),
-                    }
-                    for line, source in enumerate(sources)
-                    for esc, values in lines[source].items()
-                ],
+                "series": list(_series(plot, lines, sources)),
             }
 
 
-def _first_line(lines: Mapping[str, Mapping[int, object]], sources: list[str], esc: int) -> int:
-    return next(line for line, source in enumerate(sources) if esc in lines[source])
+def _top(line: Mapping[int, Sequence[Number]]) -> float:
+    """Return the greatest magnitude in the lines of all ESCs."""
+    known: list[float] = []
+    for values in line.values():
+        known += [abs(value) for value in values if value is not None]
+    return max(known)
+
+
+def _series(plot: Plot, lines: Lines, sources: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the series of a plot. If all have one shape, only the first of each ESC is drawn."""
+    escs_drawn = set()
+    for line, source in enumerate(sources):
+        for esc, values in lines[source].items():
+            is_drawn = not plot.has_one_shape or esc not in escs_drawn
+            escs_drawn.add(esc)
+            yield {"esc": esc, "line": line, "values": values, "drawn": is_drawn}
 
 
 def _note_on_shape(labels: Sequence[str]) -> str:
-    """Why one line stands for several, and which one it is."""
+    """Return the note on the line that represents several lines of the same shape."""
     if len(labels) < 2:
         return ""
     return f"{labels[0].lower()} drawn, the others differ only by pole pairs and gear"
 
 
 def of_like_size(tops: Mapping[str, float]) -> list[list[str]]:
-    """Groups of lines whose greatest values are not APART."""
+    """Return groups of lines whose greatest values differ by a factor of at most APART."""
     groups: list[list[str]] = []
     for source, top in tops.items():
         for group in groups:
@@ -159,15 +185,19 @@ def _head(flight: Flight, source: str, provenance: Mapping[str, str], wall_ns: i
     length = duration(flight.end_ns - flight.start_ns)
     facts = {"File": source, "Length": f"{length}, {number(flight.rows, 0)} rows"}
     if flight.start_ns != flight.origin_ns:
-        begin, end = (clock(t - flight.origin_ns) for t in (flight.start_ns, flight.end_ns))
+        begin = clock(flight.start_ns - flight.origin_ns)
+        end = clock(flight.end_ns - flight.origin_ns)
         facts["Part"] = f"{begin} to {end} of the recording"
     if wall_ns is not None:
         cut_ns = sum(cut.length_ns for cut in flight.cuts if cut.begin_ns < flight.start_ns)
         facts["Begin"] = wall_clock(wall_ns + flight.start_ns - flight.origin_ns + cut_ns)
     for esc in flight.escs:
-        devices, noted = ", then ".join(esc.devices[:8]), provenance.get(esc.name, "")
-        port = noted.rpartition(", at ")[2]
-        facts[esc.name] = ", at ".join(filter(None, (devices, port))) if devices else noted
+        noted = provenance.get(esc.name, "")
+        facts[esc.name] = noted
+        if esc.devices:
+            devices = ", then ".join(esc.devices[:8])
+            port = noted.rpartition(", at ")[2]
+            facts[esc.name] = ", at ".join(filter(None, (devices, port)))
     if flight.replayed:
         facts["Replay"] = "These frames were replayed from a recording."
     known = {label.lower() for label in facts}
@@ -207,12 +237,14 @@ def _notes(flight: Flight) -> str:
     lines = []
     if flight.points.rows_in_bucket > 1:
         lines.append(
-            f"Lines are drawn from the minimum and the maximum of each {flight.points.rows_in_bucket} rows: no peak is lost, its time is "
-            "exact to within them. All numbers in the tables are from every row."
+            "Lines are drawn from the minimum and the maximum of each "
+            f"{flight.points.rows_in_bucket} rows: no peak is lost, its time is exact to within "
+            "them. All numbers in the tables are from every row."
         )
     if any("battery_power" in esc.computed for esc in flight.escs):
         lines.append(
-            "Battery power is computed from voltage and current, because this CAN log has them more often than the power."
+            "Battery power is computed from voltage and current, "
+            "because this CAN log has them more often than the power."
         )
     if flight.seen.left_out:
         lines.append(f"{flight.seen.left_out} more events are not listed.")

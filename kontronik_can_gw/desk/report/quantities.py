@@ -1,30 +1,50 @@
-"""Plots, extremes and phases of operating states of the report: titles, order and decimals. Colours are in page.css."""
+"""Defines the plots, extremes and phases of a report: titles, order and decimals.
+
+Colours are in page.css.
+"""
 
 from typing import NamedTuple
 
 
 class Plot(NamedTuple):
-    """A plot. ``key`` names it in the page; ``lines``: label by source; ``digits``: decimals of values shown.
-
-    ``has_one_shape``: the lines differ only by a factor. One is drawn, and the cursor shows the values of all.
-    """
+    """A plot."""
 
     key: str
+    """The plot's name in the page."""
     title: str
     digits: int
+    """Decimals of the values that are shown."""
     lines: dict[str, str]
+    """Label of each line, by source."""
     has_one_shape: bool = False
+    """True if the lines differ only by a factor.
+
+    Only one of them is drawn. The cursor shows the values of all.
+    """
 
 
 # fmt: off
 PLOTS = (
     Plot("battery_voltage", "Battery voltage", 2, {"battery_voltage": "Battery"}),
     Plot("cell_voltage", "Mean cell voltage", 3, {"mean_cell_voltage": "Cell"}),
-    Plot("current", "Current", 1, {"battery_current": "Battery", "motor_current": "Motor", "peak_current": "Peak (held)"}),
+    Plot(
+        "current", "Current", 1,
+        {"battery_current": "Battery", "motor_current": "Motor", "peak_current": "Peak (held)"},
+    ),
     Plot("power", "Battery power", 0, {"battery_power": "Power"}),
-    Plot("speed", "Speed", 0, {"output_speed": "Output", "motor_speed": "Motor", "electrical_speed": "Electrical"}, has_one_shape=True),
-    Plot("temperature", "Temperature", 0, {"power_stage_temperature": "Power stage", "bec_temperature": "BEC"}),
-    Plot("throttle", "Throttle and output stage opening", 0, {"throttle": "Throttle", "output_opening": "Opening"}),
+    Plot(
+        "speed", "Speed", 0,
+        {"output_speed": "Output", "motor_speed": "Motor", "electrical_speed": "Electrical"},
+        has_one_shape=True,
+    ),
+    Plot(
+        "temperature", "Temperature", 0,
+        {"power_stage_temperature": "Power stage", "bec_temperature": "BEC"},
+    ),
+    Plot(
+        "throttle", "Throttle and output stage opening", 0,
+        {"throttle": "Throttle", "output_opening": "Opening"},
+    ),
     Plot("pwm", "PWM input", 0, {"pwm_input": "PWM input"}),
     Plot("bec_voltage", "BEC voltage", 3, {"bec_voltage": "BEC voltage"}),
     Plot("bec_current", "BEC current", 3, {"bec_current": "BEC current"}),
@@ -75,4 +95,4 @@ PHASES = (
     "Fault",
     "Unknown to this program",
 )
-"""Phases of operating states, which are shown alike; page.css has a colour for each, in this order."""
+"""Phases of operating states. All states of a phase have its colour in page.css, in this order."""

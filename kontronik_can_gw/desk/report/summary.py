@@ -1,4 +1,7 @@
-"""The numbers of a flight as HTML: tiles with the most important ones, and tables with a column for each ESC."""
+"""Renders the numbers of a flight as HTML.
+
+Tiles show the most important numbers. Tables have a column for each ESC.
+"""
 
 from collections.abc import Mapping
 from html import escape
@@ -16,36 +19,39 @@ _EXTREMES = (
     ("Lowest battery voltage", "battery_voltage", 2),
     ("Hottest power stage", "power_stage_temperature", 0),
 )
+"""Label, source and decimals of the tiles with extremes."""
 
 
 def tiles(flight: Flight) -> str:
-    """The most important numbers; with several ESCs the extreme and the name of its ESC."""
-    escs, several = flight.escs, len(flight.escs) > 1
+    """Return the most important numbers. Of several ESCs, the extreme and its ESC are shown."""
+    escs = flight.escs
+    several = len(escs) > 1
     found = [("Duration", duration(flight.end_ns - flight.start_ns), "")]
     if any(esc.has_speed for esc in escs):
         longest = duration(max(esc.turning_ns for esc in escs))
         found.append(("Motor turning", longest, "the longest of all" if several else ""))
     energies = [esc.energy_wh for esc in escs if esc.energy_wh is not None]
     if energies:
-        charges = [esc.counted.get("consumed_charge") for esc in escs]
-        charge = _plain(sum(c or 0 for c in charges), 0, "mAh") if any(charges) else ""
+        charges = [esc.counted.get("consumed_charge") or 0 for esc in escs]
+        charge = _plain(sum(charges), 0, "mAh") if any(charges) else ""
         label = "Energy, all ESCs" if several else "Energy"
         found.append((label, _plain(sum(energies), 1, "Wh"), charge))
     for label, source, digits in _EXTREMES:
-        of_escs = [
-            (esc.extremes[source], escape(esc.name) if several else "")
-            for esc in escs
-            if source in esc.extremes
-        ]
+        of_escs = []
+        for esc in escs:
+            if source in esc.extremes:
+                name = escape(esc.name) if several else ""
+                of_escs.append((esc.extremes[source], name))
         if of_escs:
-            extreme, name = (min if source in MINIMA else max)(of_escs)
+            extreme, name = min(of_escs) if source in MINIMA else max(of_escs)
             value = _plain(extreme.value, digits, VALUES[source].unit)
             found.append((label, value, f"{_at(extreme, flight)} {name}"))
     html = "".join(_tile(*each) for each in found)
     if any(esc.has_errors for esc in escs):
         severities = [event.severity for event in flight.events if event.kind == "error"]
-        errors, warnings = severities.count("error"), severities.count("warning")
-        aside = f"{warnings} warning{'' if warnings == 1 else 's'}"
+        errors = severities.count("error")
+        warnings = severities.count("warning")
+        aside = "1 warning" if warnings == 1 else f"{warnings} warnings"
         html += _tile("Errors", str(errors), aside, "bad" if errors else "good")
     return html
 
@@ -56,17 +62,23 @@ def _tile(label: str, value: str, aside: str, kind: str = "") -> str:
 
 
 def tables(flight: Flight) -> str:
-    """A table for each group: a row for each number, a column for each ESC; unknown numbers are left out."""
-    heads = "".join(f'<th scope="col">{escape(esc.name)}</th>' for esc in flight.escs)
-    head = f"<thead><tr><td></td>{heads}</tr></thead>" if len(flight.escs) > 1 else ""
+    """Return a table for each group of numbers.
+
+    It has a row for each number and a column for each ESC. Unknown numbers are left out.
+    """
+    head = ""
+    if len(flight.escs) > 1:
+        heads = "".join(f'<th scope="col">{escape(esc.name)}</th>' for esc in flight.escs)
+        head = f"<thead><tr><td></td>{heads}</tr></thead>"
     of_escs = [_numbers(esc, flight) for esc in flight.escs]
     html = ""
     for title, labels in of_escs[0].items():
         rows = ""
         for label in labels:
             values = [groups[title][label] for groups in of_escs]
-            cells = "".join(f"<td>{value or '–'}</td>" for value in values)
-            rows += f'<tr><th scope="row">{label}</th>{cells}</tr>' if any(values) else ""
+            if any(values):
+                cells = "".join(f"<td>{value or '–'}</td>" for value in values)
+                rows += f'<tr><th scope="row">{label}</th>{cells}</tr>'
         if rows:
             caption = f"<caption>{title}</caption>"
             html += f'<table class="numbers">{caption}{head}<tbody>{rows}</tbody></table>'
@@ -74,8 +86,15 @@ def tables(flight: Flight) -> str:
 
 
 def _numbers(esc: EscFlight, flight: Flight) -> dict[str, dict[str, str]]:
-    """HTML of the numbers of an ESC by group and label; empty where it is not known."""
-    rest, load = esc.rest_voltage, esc.load_voltage
+    """Return HTML of the numbers of an ESC by group and label. Unknown numbers are empty."""
+    rest = esc.rest_voltage
+    load = esc.load_voltage
+    lowest = ""
+    sag = None
+    if load is not None:
+        lowest = f"{_per_cell(load.value, esc)} {_at(load, flight)}"
+        if rest is not None:
+            sag = rest - load.value
     share = 100 * esc.telemetry_ns / max(1, flight.end_ns - flight.start_ns)
     counts = {
         label: _value(esc.counted.get(source), 0, VALUES[source].unit)
@@ -91,10 +110,8 @@ def _numbers(esc: EscFlight, flight: Flight) -> dict[str, dict[str, str]]:
         "Voltages": {
             **_extremes(MINIMA, esc, flight),
             "At rest before the first load": _per_cell(rest, esc),
-            "Lowest under load": f"{_per_cell(load.value, esc)} {_at(load, flight)}"
-            if load
-            else "",
-            "Sag": _per_cell(None if rest is None or load is None else rest - load.value, esc),
+            "Lowest under load": lowest,
+            "Sag": _per_cell(sag, esc),
         },
         "Quality of the data": {
             "With telemetry": f"{_value(share, 2, '%')} ({duration(esc.telemetry_ns)})",
@@ -110,13 +127,15 @@ def _extremes(
     found = {}
     for source, (label, digits) in quantities.items():
         extreme = esc.extremes.get(source)
-        value = "" if extreme is None else _value(extreme.value, digits, VALUES[source].unit)
-        found[label] = "" if extreme is None else f"{value} {_at(extreme, flight)}"
+        found[label] = ""
+        if extreme is not None:
+            value = _value(extreme.value, digits, VALUES[source].unit)
+            found[label] = f"{value} {_at(extreme, flight)}"
     return found
 
 
 def _at(extreme: Extreme, flight: Flight) -> str:
-    """A button that moves the plots to the time of an extreme."""
+    """Return a button that moves the plots to the time of an extreme."""
     since = extreme.time_ns - flight.origin_ns
     at = f"{since / SECOND:.6f}"
     return f'<button type="button" class="at" data-at="{at}">{clock(since)}</button>'
@@ -131,7 +150,9 @@ def _plain(value: float, digits: int, unit: str) -> str:
 
 
 def _value(value: float | None, digits: int, unit: str) -> str:
-    return "" if value is None else f"{_bold(number(value, digits))} {unit}".rstrip()
+    if value is None:
+        return ""
+    return f"{_bold(number(value, digits))} {unit}".rstrip()
 
 
 def _per_cell(voltage: float | None, esc: EscFlight) -> str:

@@ -20,6 +20,8 @@ class Row(NamedTuple):
     """Number of steps that make one ``unit``."""
     not_on: frozenset[Device] = frozenset()
     """Devices that do not supply this value."""
+    note: str = ""
+    """Anything else that a reader of the number must know."""
 
     @property
     def type_range(self) -> tuple[int, int]:
@@ -31,22 +33,25 @@ class Row(NamedTuple):
         return 0, (1 << bits) - 1
 
 
+VARIANT_BITS = 10
+"""Number of low bits of the info frame's first word that hold the variant."""
 _NOT_JIVEPRO = frozenset({Device.JIVEPRO})
 
 ElectricalSpeed = Annotated[int, Row("I", "1/min")]
 Voltage = Annotated[int, Row("H", "V", 100)]
-Current = Annotated[int, Row("h", "A", 10)]  # signed: regeneration is negative
+Current = Annotated[int, Row("h", "A", 10, note="< 0 regenerates")]
 Charge = Annotated[int, Row("H", "mAh")]
 BecCurrent = Annotated[int, Row("H", "A", 1000, not_on=_NOT_JIVEPRO)]
 BecVoltage = Annotated[int, Row("H", "V", 1000)]
 PwmInput = Annotated[int, Row("H", "µs")]
-Throttle = Annotated[int, Row("b", "%")]  # <= 0 brakes
+Throttle = Annotated[int, Row("b", "%", note="<= 0 brakes")]
 Opening = Annotated[int, Row("B", "%")]
 Temperature = Annotated[int, Row("b", "°C")]
-Word = Annotated[int, Row("I", "")]
+Word = Annotated[int, Row("I", "", note="a bit for each error")]
 State = Annotated[int, Row("B", "")]
 Timing = Annotated[int, Row("B", "µs")]
-Pair = Annotated[int, Row("H", "")]
+DevicePair = Annotated[int, Row("H", "", note=f"{VARIANT_BITS} low bits: variant")]
+VersionPair = Annotated[int, Row("H", "", note="8 low bits: sub version")]
 Count = Annotated[int, Row("B", "")]
 
 
@@ -77,8 +82,8 @@ class InfoData(NamedTuple):
     The extremes are counted from a time that the ESC chooses.
     """
 
-    device_and_variant: Pair = 0
-    firmware_word: Pair = 0
+    device_and_variant: DevicePair = 0
+    firmware_word: VersionPair = 0
     selftest_errors: Word = 0
     cell_count: Count = 0
     max_electrical_speed: ElectricalSpeed = 0
@@ -120,7 +125,7 @@ def rows(data: DataType) -> dict[str, Row]:
 
 def device_and_variant(device: int, variant: int) -> int:
     """Return the info frame's first word: device 0..63 above ten bits for variant 0..1023."""
-    return device << 10 | variant
+    return device << VARIANT_BITS | variant
 
 
 def body_format(data: DataType) -> str:

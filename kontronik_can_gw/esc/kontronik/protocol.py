@@ -4,7 +4,14 @@ from collections.abc import Mapping
 
 from kontronik_can_gw.esc.decoder import NO_NAMES, EscProtocol, Field
 from kontronik_can_gw.esc.kontronik.deframer import Deframer
-from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, body_format, rows
+from kontronik_can_gw.esc.kontronik.fields import (
+    VARIANT_BITS,
+    DataType,
+    InfoData,
+    LiveData,
+    body_format,
+    rows,
+)
 from kontronik_can_gw.esc.kontronik.states import (
     Device,
     OperatingError,
@@ -73,9 +80,9 @@ KONTRONIK = EscProtocol(
         _state_field("operating_state", _STATE_NAMES),
         _state_field("operating_state_raw"),
         *_whole_fields(InfoData),
-        _info_bits("device", "device_and_variant", shift=10, mask=0x3F, names=_DEVICES),
-        _info_bits("device_raw", "device_and_variant", shift=10, mask=0x3F),
-        _info_bits("variant", "device_and_variant", shift=0, mask=0x3FF),
+        _info_bits("device", "device_and_variant", shift=VARIANT_BITS, mask=0x3F, names=_DEVICES),
+        _info_bits("device_raw", "device_and_variant", shift=VARIANT_BITS, mask=0x3F),
+        _info_bits("variant", "device_and_variant", shift=0, mask=(1 << VARIANT_BITS) - 1),
         _info_bits("firmware_main", "firmware_word", shift=8, mask=0xFF),
         _info_bits("firmware_sub", "firmware_word", shift=0, mask=0xFF),
     ),

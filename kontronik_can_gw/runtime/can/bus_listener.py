@@ -1,6 +1,8 @@
-"""A participant of the CAN bus that only listens: it never sends, claims nothing, and comes back by itself.
+"""Receives from a CAN bus without sending, for the monitor and similar commands.
 
-It has an interface of its own beside whatever else uses it (a gateway, for one), with receive filters for the ids that were asked for.
+A BusListener opens the interface for itself, with receive filters for the requested ids. Other
+programs, for example a gateway, may use the same interface at the same time. It takes no locks,
+and it opens the interface again after a failure.
 """
 
 import logging
@@ -17,28 +19,33 @@ from kontronik_can_gw.runtime.can.socketcan_port import fault_of
 from kontronik_can_gw.status import CanState
 
 RETRY_S = 0.5
-"""How often an interface that does not work is tried again, and one that works is checked."""
+"""Interval between attempts to open a faulty interface, and between checks of an open one."""
 _MAX_AT_ONCE = 4096
-_BUS_OFF = "CAN interface {name}: is bus-off: look at bit rate, wiring and termination. Start it again: {command}"
+_BUS_OFF = (
+    "CAN interface {name}: is bus-off: look at bit rate, wiring and termination. "
+    "Start it again: {command}"
+)
 
 
 class BusListener:
-    """An open interface, received from only.
+    """An open interface from which frames are only received.
 
-    ``keys``: ids, with EXTENDED for 29 bits. Raises RunError where the interface cannot be opened now, unless ``patient``, UserError where
-    python-can does not know it; later troubles only show in ``problem``. There is no ``fileno``: the descriptor changes with each opening.
+    ``keys`` are the ids to receive; 29-bit ids have the flag EXTENDED. Raises UserError if
+    python-can does not have the interface. Raises RunError if the interface cannot be opened now,
+    except with ``patient``. Later faults are reported only in ``problem``. There is no ``fileno``,
+    because the descriptor changes each time the interface is opened.
     """
 
     def __init__(self, config: CanConfig, keys: frozenset[int], patient: bool = False) -> None:
         self.problem = ""
-        """One line with the remedy while the interface does not work; empty while it does."""
+        """One line with the fault of the interface and its remedy. Empty while it works."""
         self.lost_frames = 0
-        """How often frames were lost because they came faster than they were read."""
+        """Number of times that frames were lost because they were read too slowly."""
         self._config = config
         self._keys = keys
         self._port: CanPort | None = None
         self._check_at = 0.0
-        # what python-can says of an interface that went away is said by ``problem``, with the remedy
+        # ``problem`` replaces python-can's log of a lost interface, because it has the remedy too.
         logging.getLogger("can").addHandler(logging.NullHandler())
         try:
             self._open()
@@ -48,14 +55,18 @@ class BusListener:
             self.problem = error.problems[0]
 
     def receive(self, timeout_s: float) -> list[CanFrame]:
-        """The frames that have come, oldest first; waits for the first one, at most ``timeout_s``. Never raises."""
+        """Return the received frames, oldest first. Never raises.
+
+        Waits at most ``timeout_s`` for the first frame.
+        """
         end = time.monotonic() + timeout_s
         while True:
             now = time.monotonic()
             if now >= self._check_at:
                 self._check_at = now + RETRY_S
                 self._check()
-            if frames := self._take():
+            frames = self._take()
+            if frames:
                 return frames
             now = time.monotonic()
             if now >= end:
@@ -63,7 +74,7 @@ class BusListener:
             self._wait(min(end, max(now, self._check_at)) - now)
 
     def close(self) -> None:
-        """May be called again."""
+        """Close the interface. A second call changes nothing."""
         if self._port is not None:
             self._port.close()
             self._port = None
@@ -79,10 +90,11 @@ class BusListener:
         self.problem = ""
 
     def _check(self) -> None:
-        """Whether the interface works; open it anew where it does not."""
+        """Update ``problem``, and open the interface again if it was lost."""
         config = self._config
-        fault = fault_of(config.channel) if config.interface == "socketcan" else 0
-        if self._port is not None and (fault or self._port.gone):
+        is_socketcan = config.interface == "socketcan"
+        has_fault = is_socketcan and fault_of(config.channel) != 0
+        if self._port is not None and (has_fault or self._port.gone):
             self.close()
         if self._port is None:
             try:
@@ -90,9 +102,8 @@ class BusListener:
             except UserError as error:
                 self.problem = error.problems[0]
         else:
-            is_off = self._port.state is CanState.BUS_OFF and config.interface == "socketcan"
             self.problem = ""
-            if is_off:
+            if is_socketcan and self._port.state is CanState.BUS_OFF:
                 command = restart(config.channel, "type can restart-ms 100")
                 self.problem = _BUS_OFF.format(name=config.channel, command=command)
 
@@ -108,7 +119,8 @@ class BusListener:
         elif frames:
             self.problem = ""
             if self._port.state in (CanState.BUS_OFF, CanState.DOWN):
-                self._port.state = CanState.ERROR_ACTIVE  # what comes says that it works again
+                # A received frame proves that the interface works again.
+                self._port.state = CanState.ERROR_ACTIVE
         return frames
 
     def _wait(self, seconds: float) -> None:

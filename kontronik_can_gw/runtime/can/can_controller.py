@@ -1,4 +1,7 @@
-"""The CAN controller: its state from error frames and from rtnetlink, bus-off and its end, the bit rate."""
+"""Follows the state of the CAN controller: error states, bus-off and its end, bit rate.
+
+The sources are the port's error frames and the kernel's reports by rtnetlink.
+"""
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.gateway.gateway import Gateway
@@ -9,35 +12,40 @@ from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.status import CanState, name_in_words
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
-ASK_NS, ASK_OFF_NS = SECOND, 100 * MS
-"""How often the kernel is asked for the controller's state: as a rule, and in bus-off."""
-ASK_RESTARTING_NS, SETTLING_NS = 20 * MS, 200 * MS
+ASK_NS = SECOND
+"""Interval at which the kernel is asked for the controller's state, except in bus-off."""
+ASK_OFF_NS = 100 * MS
+"""The same interval in bus-off."""
+ASK_RESTARTING_NS = 20 * MS
+"""The same interval after a restart, until the driver reports another state than bus-off."""
+SETTLING_NS = 200 * MS
+"""Time after which a restarted controller is used even if its driver still reports bus-off."""
 RESTARTED_NS = SECOND
-"""A driver may go on reporting bus-off for this long after a restart."""
+"""Time after a restart in which a driver's report of bus-off is ignored, because it may be old."""
 UNCONFIRMED_OFF_NS = SECOND
-"""A bus-off that the kernel cannot confirm ends after this time at the latest.
+"""Longest duration of a bus-off that the kernel cannot confirm.
 
 On a virtual bus any participant can send the error frame, and nothing restarts a controller there.
-The kernel knows no controller of a virtual interface, and nothing of the adapters of python-can.
+The kernel has no controller for a virtual interface, and no information on python-can's adapters.
 """
 
 
 class CanController:
-    """What is known of an interface's controller. ``due``: when it is to be asked.
-
-    ``facts``: what the kernel reported last; None where it reports nothing of this interface.
-    """
+    """The state of an interface's CAN controller."""
 
     def __init__(self, config: CanConfig, gateway: Gateway, conditions: FaultLog) -> None:
         self.facts: LinkFacts | None = None
+        """The kernel's last report. None if it does not report this interface."""
         self.is_off = False
-        """In bus-off."""
+        """True in bus-off."""
         self.due = NEVER
+        """Time at which ``ask`` must be called."""
         self.condition = f"CAN {config.channel}: controller"
         self._config = config
         self._gateway = gateway
         self._conditions = conditions
         self._runs_since: int | None = None
+        """Time since which the interface runs again although the driver reports bus-off."""
         self._off_since = 0
         self._restarted_ns = -RESTARTED_NS
         self._monitor: LinkMonitor | None = None
@@ -47,17 +55,23 @@ class CanController:
             self.due = 0
 
     def fileno(self) -> int | None:
-        """Readable when the kernel has something to report; None where it reports nothing."""
+        """Return a descriptor that is readable when the kernel has sent a report.
+
+        None if the kernel does not report this interface.
+        """
         return None if self._monitor is None else self._monitor.fileno()
 
     def close(self) -> None:
-        """Ask and hear no more."""
+        """Stop asking the kernel and receiving its reports."""
         if self._monitor is not None:
             self._monitor.close()
             self._monitor = None
 
     def ask(self, now: int) -> None:
-        """Ask how the interface is. In bus-off ``due`` is set even if there is nothing to ask."""
+        """Ask the kernel for the state of the interface.
+
+        In bus-off, ``due`` is set even if the kernel cannot be asked.
+        """
         if self._monitor is not None:
             self._monitor.ask()
         if self.is_off:
@@ -66,40 +80,44 @@ class CanController:
             self.due = NEVER if self._monitor is None else now + ASK_NS
 
     def take(self) -> list[LinkFacts]:
-        """What the kernel has reported since the last call, oldest first."""
+        """Return the kernel's reports since the last call, oldest first."""
         return [] if self._monitor is None else self._monitor.take()
 
     def note(self, facts: LinkFacts, now: int) -> None:
-        """Take over what the kernel reports of the interface."""
+        """Store a report of the kernel, and log a wrong bit rate."""
         self.facts = facts
         self._follow_bitrate(facts.bitrate, now)
 
     def refresh(self, now: int) -> None:
-        """Learn how the interface is now; older reports are ignored."""
+        """Ask the kernel and store its answer. Older reports are ignored."""
         self.ask(now)
-        if reports := self.take():
+        reports = self.take()
+        if reports:
             self.note(reports[-1], now)
 
     def note_state(self, facts: LinkFacts, port: CanPort, now: int) -> None:
-        """Takes over the kernel's state of the controller.
+        """Give the kernel's state of the controller to the port.
 
-        A driver may learn of a restart later than its error frames report it.
+        Some drivers still report bus-off to the kernel after their error frames reported a
+        restart. Such an old state is ignored.
         """
-        is_old = facts.state is CanState.BUS_OFF and (
-            self.is_off or now - self._restarted_ns < RESTARTED_NS
-        )
-        if facts.state is not None and facts.state is not port.state and not is_old:
-            port.note_state(facts.state)
+        state = facts.state
+        if state is None or state is port.state:
+            return
+        was_restarted = now - self._restarted_ns < RESTARTED_NS
+        is_old = state is CanState.BUS_OFF and (self.is_off or was_restarted)
+        if not is_old:
+            port.note_state(state)
 
     def end_unconfirmed_off(self, port: CanPort, now: int) -> None:
-        """End a bus-off that has lasted long enough without a confirmation of the kernel."""
+        """End a bus-off that has lasted UNCONFIRMED_OFF_NS without a confirmation by the kernel."""
         is_confirmed = self.facts is not None and self.facts.state is not None
         if self.is_off and not is_confirmed and now - self._off_since >= UNCONFIRMED_OFF_NS:
             port.note_state(CanState.ERROR_ACTIVE)
             self.follow(port, now)
 
     def follow(self, port: CanPort, now: int) -> None:
-        """The port may have another state than the gateway knows: pass it on, log what it means."""
+        """Report a new state of the port to the gateway, and log it."""
         status = self._gateway.status
         if port.bus_off_count:
             status.bus_off_count += port.bus_off_count
@@ -109,7 +127,8 @@ class CanController:
         if self.is_off and port.state is not CanState.BUS_OFF:
             if not self._has_restarted(now):
                 return
-            self._restarted_ns, self._runs_since = now, None
+            self._restarted_ns = now
+            self._runs_since = None
         self.is_off = port.state is CanState.BUS_OFF
         self._off_since = now
         self._gateway.set_can_state(port.state, now)
@@ -118,17 +137,21 @@ class CanController:
             self._conditions.begin(self.condition, f"{name}: bus-off.{self._restart_hint()}", now)
             self.ask(now)
         elif port.state is CanState.ERROR_PASSIVE:
-            text = f"{name}: error-passive: wrong bit rate, a cable or termination fault, or nobody acknowledges."
+            text = (
+                f"{name}: error-passive: wrong bit rate, a cable or termination fault, "
+                "or nobody acknowledges."
+            )
             self._conditions.begin(self.condition, text, now)
         elif port.state is not CanState.UNKNOWN:
             word = name_in_words(port.state.name)
             self._conditions.end(self.condition, f"{name}: {word}", now)
 
     def _has_restarted(self, now: int) -> bool:
-        """Whether a controller that left bus-off takes frames again; before that they vanish without a word.
+        """Return True if a controller that left bus-off accepts frames again.
 
-        The kernel says "restarted" first, then lets the queue run, then starts the controller; only then its state is another one. There
-        are drivers that learn that late: they are not waited for.
+        Frames that are sent earlier are lost without an error. The kernel first reports
+        "restarted", then starts the queue and then the controller, and changes its state last.
+        Some drivers change it late. They are waited for only for SETTLING_NS.
         """
         self.refresh(now)
         if self.facts is None:
@@ -137,20 +160,24 @@ class CanController:
             self._runs_since = None
             return False
         if self.facts.state is CanState.BUS_OFF:
-            self._runs_since = now if self._runs_since is None else self._runs_since
+            if self._runs_since is None:
+                self._runs_since = now
             self.due = now + ASK_RESTARTING_NS
             return now - self._runs_since > SETTLING_NS
         return True
 
     def _follow_bitrate(self, bitrate: int | None, now: int) -> None:
-        name, wanted = self._config.channel, self._config.bitrate
-        if bitrate and bitrate != wanted:
-            text = f"CAN {name} runs at {bitrate} bit/s, can.bitrate says {wanted}: make them the same."
-            self._conditions.begin(f"CAN {name}: bit rate", text, now)
-        elif bitrate:
-            self._conditions.end(
-                f"CAN {name}: bit rate", f"CAN {name} runs at {bitrate} bit/s", now
-            )
+        if not bitrate:
+            return
+        wanted = self._config.bitrate
+        name = f"CAN {self._config.channel}"
+        condition = f"{name}: bit rate"
+        text = f"{name} runs at {bitrate} bit/s"
+        if bitrate == wanted:
+            self._conditions.end(condition, text, now)
+        else:
+            text = f"{text}, can.bitrate says {wanted}: make them the same."
+            self._conditions.begin(condition, text, now)
 
     def _restart_hint(self) -> str:
         if self.facts is None or self.facts.restart_ms != 0:

@@ -1,6 +1,6 @@
-"""The CAN interface as the loop has it: opened, lost, found again, received from.
+"""Opens the gateway's CAN interface, receives from it, and opens it again after a failure.
 
-Sending is in transmitter.py, the controller's state in can_controller.py.
+transmitter.py sends frames, and can_controller.py follows the controller's state.
 """
 
 import contextlib
@@ -35,7 +35,11 @@ _OK = Sent.OK  # an enumeration's members are slow to look up
 
 
 class CanLink:
-    """The interface of a gateway. ``esc_at`` names the ESC that a path leads to: it must never be opened as a CAN adapter."""
+    """The CAN interface of a gateway.
+
+    ``esc_at`` returns the name of the ESC to which a path leads, or None. The port of an ESC must
+    never be opened as a CAN adapter.
+    """
 
     def __init__(
         self,
@@ -56,42 +60,49 @@ class CanLink:
         self.condition = f"CAN {config.channel}: interface"
         self.opening_condition = f"CAN {config.channel}: opening"
         self._opening_since: int | None = None
-        """When the opening beside the loop began that has not ended yet."""
+        """Start of the opening by the opener's thread. None if the thread does not open."""
         self._clock = clock
         self._retry = Retry(MAX_RETRY_NS)
         self._own_ids = IdLocks(config, gateway, conditions)
         self._receive_ids: frozenset[int] | None = None
-        """What the open port was asked to receive."""
+        """The ids that the open port receives."""
         self.is_proven = False
-        """A frame was taken since the interface failed last."""
+        """True if the interface has accepted a frame since its last failure."""
         self._drained = True
         self._noted = PortInput()
         self._stuck = StuckCheck(self._noted)
-        if (fd := self.controller.fileno()) is not None:
+        fd = self.controller.fileno()
+        if fd is not None:
             poller.register(fd, self.hear)
-        self.must_open = False  # the first opening is under way, and its failure ends the gateway
+        self.must_open = False
+        """True during the first opening by the thread, if its failure ends the gateway."""
         self._opener = CanOpener(config, esc_at)
         poller.register(self._opener.fileno(), self._follow_opener)
 
     @property
     def due(self) -> int:
-        """When ``reopen``, ``transmit`` or, in bus-off, the controller's ``ask`` has something to do.
+        """Time of the next call of ``reopen``, ``transmit`` or, in bus-off, ``controller.ask``.
 
-        Otherwise the controller is asked when the loop comes round: it need not be woken for that.
+        Except in bus-off the loop asks the controller in any of its turns, and need not wake up
+        for that.
         """
         due = self.transmitter.due
         if self.controller.is_off:
             due = min(due, self.controller.due)
-        return due if self._retry.due is None else min(due, self._retry.due)
+        if self._retry.due is not None:
+            due = min(due, self._retry.due)
+        return due
 
     @property
     def is_open(self) -> bool:
         return self.port is not None
 
     def open(self, now: int, wait: bool) -> None:
-        """Open the interface, or start to. RunError if that fails, unless ``wait``; a driver's failure is raised by a later turn.
+        """Open the interface, or let the opener's thread open it.
 
-        RunError in any case if another gateway has one of our node-IDs or sends our messages.
+        Raises RunError if another gateway uses one of our node-IDs or sends our messages. Without
+        ``wait``, RunError is also raised if the interface cannot be opened. If the thread opens
+        it, a later turn of the loop raises this error.
         """
         self._own_ids.lock(at_start=True)
         try:
@@ -103,17 +114,17 @@ class CanLink:
             self._failed(str(error), now)
 
     def reopen(self, now: int) -> None:
-        """Try again what is due."""
+        """Open a lost interface again if the next attempt is due."""
         if self._retry.due is None or now < self._retry.due or self.port is not None:
             return
         try:
             if self._open(now):
-                self._gateway.can_returned(max(now, self._clock()))  # to open may take long
+                self._gateway.can_returned(max(now, self._clock()))  # opening may take long
         except RunError as error:
             self._failed(str(error), now)
 
     def _follow_opener(self, now: int, _events: int = 0) -> None:
-        """An opening beside the loop has ended."""
+        """Use the result of the opener's thread. Call it when the opener is readable."""
         result = self._opener.take()
         if result is not None:
             self._opening_since = None
@@ -133,53 +144,60 @@ class CanLink:
         if since is not None and now - since >= SLOW_OPENING_NS:
             text = (
                 f"CAN {self.config.interface} {self.config.channel}: still opening: "
-                "the driver does not return. Check the adapter; restart the gateway if it was replaced."
+                "the driver does not return. "
+                "Check the adapter; restart the gateway if it was replaced."
             )
             self._conditions.begin(self.opening_condition, text, now, since=since)
 
     def close(self) -> None:
         """Close everything. A second call changes nothing."""
-        self._close_port()  # first: the opener's thread waits for a slow driver, this one does not
-        if (opener_fd := self._opener.fileno()) >= 0:
+        self._close_port()  # first, so that the opener's thread waits for a slow driver
+        opener_fd = self._opener.fileno()
+        if opener_fd >= 0:
             self._poller.unregister(opener_fd)
             self._opener.close()
         self._own_ids.close()
-        if (fd := self.controller.fileno()) is not None:
+        fd = self.controller.fileno()
+        if fd is not None:
             self._poller.unregister(fd)
             self.controller.close()
 
     def _open(self, now: int) -> bool:
-        """Opens the interface. False if it will be open later."""
+        """Open the interface. Returns False if the opener's thread opens it."""
         self._retry.due = None
-        if (port := self._opener.open()) is not None:
-            self._use(port, now)
-        else:
+        port = self._opener.open()
+        if port is None:
             self._opening_since = now
-        return port is not None
+            return False
+        self._use(port, now)
+        return True
 
     def _use(self, port: CanPort, now: int) -> None:
-        """Takes over an open port."""
+        """Use an open port."""
         self.port = port
         self._retry.due = None
         self.transmitter.forget_failures()
         self.controller.is_off = False
         self._stuck = StuckCheck(self._noted)
-        if (fd := port.fileno()) is not None:
+        fd = port.fileno()
+        if fd is not None:
             self._poller.register(fd, self.serve)
         self._receive_ids = None
         self.follow_ids()
         self._gateway.can_opened(now)
-        self.controller.refresh(now)  # older reports, as that it was down, are past
+        self.controller.refresh(now)  # older reports, for example of a link down, are obsolete
         text = f"CAN {self.config.interface} {self.config.channel} is open"
         if self._conditions.is_on(self.opening_condition):
             self._conditions.end(self.opening_condition, text, now)
-        elif not self._conditions.is_on(self.condition):  # otherwise logged when a frame is sent
+        elif not self._conditions.is_on(self.condition):
+            # After a failure, the recovery is logged when the first frame is sent.
             self._conditions.say(logging.INFO, text)
 
     def _close_port(self) -> None:
         self.transmitter.forget_failures()
         if self.port is not None:
-            if (fd := self.port.fileno()) is not None:
+            fd = self.port.fileno()
+            if fd is not None:
                 with contextlib.suppress(KeyError, ValueError):
                     self._poller.unregister(fd)
             self._opener.close_port(self.port)
@@ -193,22 +211,22 @@ class CanLink:
         self._conditions.begin(self.condition, f"{reason} Trying again.", now)
 
     def _lost(self, answer: Sent, now: int) -> None:
-        """The interface is down or gone: to be opened anew."""
+        """Close an interface that is down or was removed, and schedule its opening."""
         self._close_port()
         self._failed(_reason_of_loss(self.config, answer), now)
-        self.controller.ask(now)  # it may be there again already
+        self.controller.ask(now)  # it may already be usable again
 
-    # --- what comes
+    # --- receiving
 
     def ask(self, now: int) -> None:
-        """Learn from the kernel how the interface is; it answers at once, so that the loop need not be woken for that."""
+        """Ask the kernel for the state of the interface, and use its immediate answer."""
         self.controller.ask(now)
         self.hear(now)
         if self.port is not None:
             self.controller.end_unconfirmed_off(self.port, now)
 
     def hear(self, now: int, _events: int = 0) -> None:
-        """The kernel has reported something of the interface."""
+        """Use the kernel's reports on the interface. Call it when they are readable."""
         for facts in self.controller.take():
             self._follow(facts, now)
 
@@ -224,19 +242,20 @@ class CanLink:
             self.controller.follow(self.port, now)
 
     def follow_ids(self) -> None:
-        """Let the open port receive what the gateway listens to, if that has changed."""
+        """Update the ids that the open port receives, if the gateway's ids have changed."""
         ids = self._gateway.receive_ids
         if self.port is None or ids is self._receive_ids:
             return
         had_fd = self.port.fileno() is not None
         self._receive_ids = ids
         self.port.set_receive_ids(ids)
-        if not had_fd and (fd := self.port.fileno()) is not None:
+        fd = self.port.fileno()
+        if fd is not None and not had_fd:
             self._poller.register(fd, self.serve)
         self._own_ids.lock()
 
     def serve(self, now: int, events: int = select.POLLIN) -> None:
-        """The port is readable, or can be sent to again."""
+        """Receive frames. Call it when the port is readable, or writable again."""
         self._noted.served = True
         if self.port is None:
             return
@@ -248,23 +267,29 @@ class CanLink:
             frames = self.port.receive()
             self._drained = self.port.drained
             self._gateway.status.received_frames += len(frames)
-            for frame, at in frames:
-                # a wall clock that was set moves no frame out of the time in which it must have come
-                self._gateway.receive_frame(
-                    frame, now, now if at is None else min(max(at, since), now)
-                )
+            for frame, received_ns in frames:
+                if received_ns is None:
+                    received_ns = now
+                else:
+                    # The time depends on the wall clock, which may have been set. The limits are
+                    # the times between which the frame must have been received.
+                    received_ns = min(max(received_ns, since), now)
+                self._gateway.receive_frame(frame, now, received_ns)
             self._follow_reception(now)
 
     def is_stuck(self) -> bool:
-        """True if the loop does not serve this port."""
+        """Return True if the loop does not serve this port."""
         return self._stuck.is_stuck(self.port)
 
     def transmit(self, now: int) -> None:
-        """Hands over the frames that are due, as far as the interface takes them.
+        """Hand the due frames to the interface until it refuses one.
 
-        In bus-off nothing is handed over: it would be sent late, after the restart, or be lost.
+        In bus-off no frame is handed over, because it would be lost, or sent late after the
+        restart.
         """
-        frames, port, transmitter = self._gateway.take_frames(now), self.port, self.transmitter
+        frames = self._gateway.take_frames(now)
+        port = self.port
+        transmitter = self.transmitter
         if frames:
             transmitter.put(frames)
         if port is None or self.controller.is_off:
@@ -287,19 +312,19 @@ class CanLink:
         self.controller.follow(port, now)
 
     def _watch(self, events: int) -> None:
-        if self.port is not None and (fd := self.port.fileno()) is not None:
+        fd = None if self.port is None else self.port.fileno()
+        if fd is not None:
             self._poller.register(fd, self.serve, events)
 
     def _prove(self, now: int) -> None:
-        """The interface works: a frame was taken."""
+        """End the fault of the interface, because it has accepted a frame."""
         self.is_proven = True
         self._retry.succeeded()
-        self._conditions.end(
-            self.condition, f"CAN {self.config.channel}: frames are sent again", now
-        )
+        text = f"CAN {self.config.channel}: frames are sent again"
+        self._conditions.end(self.condition, text, now)
 
     def _follow_reception(self, now: int) -> None:
-        """What receiving showed of the interface itself."""
+        """Report overruns, a lost interface or a new controller state after a reception."""
         port = self.port
         assert port is not None
         if port.overruns:
@@ -312,7 +337,7 @@ class CanLink:
 
 
 def _reason_of_loss(config: CanConfig, answer: Sent) -> str:
-    """What is wrong with an interface that answered DOWN or GONE."""
+    """Return the error message for an interface that returned DOWN or GONE."""
     if config.interface != "socketcan":
         return f"CAN {config.interface} {config.channel}: the adapter has failed."
     number = errno.ENETDOWN if answer is Sent.DOWN else errno.ENODEV

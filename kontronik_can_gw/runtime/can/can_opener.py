@@ -1,7 +1,8 @@
-"""Opens and closes a python-can interface in a thread: a driver may take seconds (slcan sleeps for two), and the loop must not wait.
+"""Opens and closes a python-can interface in a thread.
 
-``_work`` runs in the worker's thread, everything else in the loop's. They share the results, and ``_is_closed``, which only the loop
-writes.
+A driver may take seconds (slcan sleeps for two), and the loop must not wait for it. ``_work`` runs
+in the worker's thread, everything else in the loop's thread. The threads share the results, and
+``_is_closed``, which only the loop writes.
 """
 
 import contextlib
@@ -14,19 +15,23 @@ from kontronik_can_gw.runtime.can.open_can import open_can
 from kontronik_can_gw.runtime.system.worker import Handover, Worker
 
 _AT_ONCE = ("socketcan", "virtual")
-"""Interfaces that wait for nothing when they are opened: SocketCAN, and python-can's bus within the process."""
+"""Interfaces that open without delay: SocketCAN, and python-can's bus within the process."""
 _END_S = 0.15
-"""How long ``close`` waits for a driver that opens or closes: the process must end within 0.3 s."""
+"""Longest time that ``close`` waits for a driver. The process must end within 0.3 s."""
 _NO_THREAD = "CAN {0.interface} {0.channel}: the system gives no thread to open it."
 
 
 class CanOpener:
-    """Opens and closes the interface of a gateway. ``esc_at`` names the ESC that a path leads to: it is never opened.
+    """Opens and closes the interface of a gateway.
 
-    1. ``open`` returns an open port, or None if the interface is being opened by the thread. Then ``fileno`` becomes readable when that
-       is done, and ``take`` returns the result.
+    ``esc_at`` returns the name of the ESC to which a path leads, or None. The port of an ESC is
+    never opened.
+
+    1. ``open`` returns an open port, or None if the thread opens the interface. In this case
+       ``fileno`` becomes readable when the thread is ready, and ``take`` returns the result.
     2. ``close_port`` closes a port. The thread closes and opens in the order of the calls.
-    3. After ``close`` a port that is still being opened is closed as soon as it is open, and ``close_port`` closes at once.
+    3. After ``close``, a port that is still being opened is closed as soon as it is open, and
+       ``close_port`` closes at once.
     """
 
     def __init__(
@@ -43,16 +48,20 @@ class CanOpener:
         return self._results.fileno()
 
     def open(self) -> CanPort | None:
-        """Open the interface, or start to. RunError if it cannot be opened, as far as that is known at once."""
+        """Return the open interface, or let the thread open it and return None.
+
+        Raises RunError if it is known at once that the interface cannot be opened.
+        """
         config = self._config
-        if (esc := self._esc_at(config.channel)) is not None:  # whatever its name is now
+        esc = self._esc_at(config.channel)
+        if esc is not None:
             raise RunError(
                 f"can.channel {config.channel} is the port of {esc}: nothing may be sent to an ESC."
             )
         if self._is_at_once:
             try:
                 return open_can(config)
-            except OSError as error:  # it went away a moment ago
+            except OSError as error:  # the interface was removed since it was checked
                 reason = error.strerror or error
                 raise RunError(f"CAN interface {config.channel}: {reason}.") from None
         if not (self._worker.start() and self._worker.put(None)):
@@ -60,17 +69,20 @@ class CanOpener:
         return None
 
     def close_port(self, port: CanPort) -> None:
-        """Close a port; a driver's without waiting for it."""
+        """Close a port. Does not wait for a driver of python-can."""
         if self._is_at_once or not self._worker.put(port):
             port.close()
 
     def take(self) -> CanPort | RunError | None:
-        """The result of ``open``: a port, or the reason why there is none. None if it is not known yet."""
+        """Return the result of ``open``: a port, or the reason of the failure.
+
+        None if the thread is not ready yet.
+        """
         found = self._results.take(1)
         return found[0] if found else None
 
     def close(self) -> None:
-        """End the thread. A driver that takes longer is left alone."""
+        """End the thread. Waits at most _END_S for a slow driver, which then ends later."""
         self._is_closed = True
         self._worker.stop(_END_S)
         for left in self._results.take():
@@ -80,7 +92,7 @@ class CanOpener:
     def _work(self, items: list[CanPort | None]) -> None:
         for port in items:
             if port is not None:
-                with contextlib.suppress(Exception):  # whatever a driver raises: the next is served
+                with contextlib.suppress(Exception):  # drivers raise exceptions of any kind
                     port.close()
             elif not self._is_closed:
                 result = self._open()
@@ -95,7 +107,7 @@ class CanOpener:
             return open_can(config)
         except RunError as error:
             return error
-        except Exception as error:  # whatever a driver raises: the loop tries again
+        except Exception as error:  # drivers raise exceptions of any kind; the loop tries again
             return RunError(f"CAN {config.interface} {config.channel}: cannot be opened: {error}")
 
 

@@ -1,8 +1,11 @@
-"""A CAN interface as the loop uses it: what a raw socket (socketcan_port.py) and python-can's drivers (open_can.py) have in common.
+"""The interface of an open CAN port, as the loop uses it.
 
-``send`` never blocks on SocketCAN and never raises: it says what became of the frame. ``receive`` never blocks and never raises. Data
-frames come only with ids that were asked for, so that foreign traffic does not wake the process. Ids here are as SocketCAN has them:
-bit 31 marks a 29-bit one.
+It is implemented by a raw socket (socketcan_port.py) and for python-can's drivers (open_can.py).
+
+1. ``send`` never raises, and never blocks on SocketCAN. It returns the result for the frame.
+2. ``receive`` never blocks and never raises. It returns only data frames with the requested ids,
+   so that other traffic does not wake the process.
+3. Ids are written as in SocketCAN: bit 31 marks a 29-bit id.
 """
 
 import select
@@ -15,47 +18,56 @@ from kontronik_can_gw.frames import CanFrame, block_of
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.status import CanState
 
-RECEIVE_LIMIT, _DISCARD_LIMIT = 64, 4096
-"""Frames, error frames among them, that one call of ``receive`` or ``discard`` takes at most."""
+RECEIVE_LIMIT = 64
+"""Maximum number of frames, including error frames, that one call of ``receive`` reads."""
+_DISCARD_LIMIT = 4096
+"""The same limit of ``discard``."""
 MAX_STANDARD_ID = 0x7FF
 # An enumeration's members are slow to look up.
-_DOWN, _UNKNOWN = CanState.DOWN, CanState.UNKNOWN
+_DOWN = CanState.DOWN
+_UNKNOWN = CanState.UNKNOWN
 _OK = Sent.OK
 
 Received = list[tuple[CanFrame, int | None]]
-"""Frames, each with the time at which it came, on the monotonic clock; None where that is not known."""
+"""Frames with their times of reception on the monotonic clock. A time is None if unknown."""
 
 
 class CanPort(ABC):
     """An open interface that is up."""
 
     is_socket = False
-    """True where ``fileno`` is a socket that takes struct can_frame and canfd_frame.
+    """True if ``fileno`` is a socket that accepts struct can_frame and canfd_frame.
 
-    Elsewhere a send that fails for want of room and one on a dead adapter look the same.
+    Without a socket, a full queue cannot be distinguished from a dead adapter.
     """
 
     def __init__(self) -> None:
         self.state = CanState.UNKNOWN
         self.gone = False
-        """The interface was removed or its driver failed: close it and open it anew."""
+        """True if the interface was removed or its driver failed. It must be opened again."""
         self.bus_off_count = 0
-        """How often the controller went to bus-off; its reader may set it back to 0."""
+        """Number of times that the controller entered bus-off. The reader may set it back to 0."""
         self.overruns = 0
-        """How often received frames were lost, in the controller or because we were late; its reader may set it back to 0."""
+        """Number of times that received frames were lost. The reader may set it back to 0.
+
+        They are lost in the controller, or because they were not read in time.
+        """
         self.drained = True
-        """Whether the last ``receive`` left nothing: what it did not return may have been taken, as error frames are."""
+        """True if the last ``receive`` left no frame, including frames that it does not return."""
         self._ids: frozenset[int] = frozenset()
         self._blocks: tuple[int, ...] = ()
         self._known_drops = 0
 
     @abstractmethod
     def fileno(self) -> int | None:
-        """Readable when ``receive`` has something to do; None where nothing can come. ``set_receive_ids`` may change it."""
+        """Return a descriptor that is readable when there are frames for ``receive``.
+
+        None if no frame can be received. ``set_receive_ids`` may change the descriptor.
+        """
 
     @property
     def waits_to_be_read(self) -> bool:
-        """True while ``receive`` would find something."""
+        """True if ``receive`` would read a frame."""
         fd = self.fileno()
         if fd is None:
             return False
@@ -64,12 +76,12 @@ class CanPort(ABC):
         return bool(poll.poll(0))
 
     def note_state(self, state: CanState) -> None:
-        """Take over what else is known of the controller (rtnetlink)."""
+        """Store a state of the controller that another source (rtnetlink) reported."""
         self.bus_off_count += state is CanState.BUS_OFF and self.state is not CanState.BUS_OFF
         self.state = state
 
     def set_receive_ids(self, ids: Collection[int]) -> None:
-        """From now on receive data frames with these ids, in these blocks, and no others."""
+        """Receive only data frames with these ids. A member may also be a block of ids."""
         self._ids = frozenset(ids)
         self._blocks = tuple(can_id for can_id in ids if can_id >> 32)
         self._filter()
@@ -79,10 +91,16 @@ class CanPort(ABC):
 
     @abstractmethod
     def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
-        """The data frames that have come, oldest first, at most ``limit``; follow the controller's state from error frames."""
+        """Return the received data frames, oldest first, at most ``limit``.
+
+        Error frames are not returned. They update the state of the controller.
+        """
 
     def discard(self) -> None:
-        """Throw away the data frames that wait to be received. What error frames say still counts; data frames lost before do not."""
+        """Discard the data frames that have not been received yet.
+
+        Error frames still update the state. Data frames that were lost earlier are not counted.
+        """
         self.receive(_DISCARD_LIMIT)
         self._known_drops = self._drops()
 
@@ -96,11 +114,15 @@ class CanPort(ABC):
         clock: Callable[[], int] = time.monotonic_ns,
         latest: int = sys.maxsize,
     ) -> tuple[int, Sent]:
-        """Hand frames to the interface until it does not take one, or ``clock`` is beyond ``latest``: the process was stopped meanwhile.
+        """Hand frames to the interface until it refuses one.
 
-        Returns how many went and the last answer.
+        Also ends if ``clock`` returns a time after ``latest``, because the process was suspended
+        meanwhile. Returns the number of accepted frames and the last result.
         """
-        count, answer = (0, Sent.GONE) if self.gone else self._send_each(frames, clock, latest)
+        if self.gone:
+            self.state = _DOWN
+            return 0, Sent.GONE
+        count, answer = self._send_each(frames, clock, latest)
         if count and (self.state is _DOWN or self.state is _UNKNOWN):
             self.state = CanState.ERROR_ACTIVE
         if answer is not _OK and (answer is Sent.DOWN or answer is Sent.GONE):
@@ -113,7 +135,7 @@ class CanPort(ABC):
 
     @abstractmethod
     def _filter(self) -> None:
-        """Let only frames with ``_ids`` come."""
+        """Set the receive filter to ``_ids``."""
 
     @abstractmethod
     def _send_each(
@@ -122,7 +144,7 @@ class CanPort(ABC):
 
     @abstractmethod
     def _drops(self) -> int:
-        """Received frames that were dropped since opening because too many waited for us."""
+        """Return the number of frames that were dropped since opening because of a full queue."""
 
     def _note_drops(self) -> None:
         drops = self._drops()

@@ -1,6 +1,7 @@
-"""The `ip link` commands that messages advise. Which one works depends on the kind of the interface.
+"""Forms the `ip link` commands that messages advise.
 
-A controller (can0) needs its bit rate. A virtual interface (vcan, vxcan) has none, and refuses options of a controller.
+They depend on the kind of the interface. A controller (can0) needs its bit rate. A virtual
+interface (vcan, vxcan) has no bit rate, and refuses options of a controller.
 """
 
 from contextlib import closing
@@ -34,16 +35,20 @@ def kind_by_name(name: str) -> str:
 
 def controller_settings(config: CanConfig) -> str:
     """Return the options of `ip link set` for a controller."""
-    fd = f" dbitrate {config.data_bitrate} fd on" if config.fd else ""
-    return f"type can bitrate {config.bitrate}{fd}"
+    settings = f"type can bitrate {config.bitrate}"
+    if config.fd:
+        settings += f" dbitrate {config.data_bitrate} fd on"
+    return settings
 
 
 def set_up(config: CanConfig, kind: str) -> str:
     """Return the command that sets up an interface of this kind."""
     command = f"sudo ip link set {config.channel}"
-    if kind in VIRTUAL:
-        return f"{command} {f'mtu {_FD_MTU} ' if config.fd else ''}up"
-    return f"{command} up {controller_settings(config)} restart-ms 100"
+    if kind not in VIRTUAL:
+        return f"{command} up {controller_settings(config)} restart-ms 100"
+    if config.fd:
+        return f"{command} mtu {_FD_MTU} up"
+    return f"{command} up"
 
 
 def add_virtual(config: CanConfig) -> str:
@@ -52,7 +57,10 @@ def add_virtual(config: CanConfig) -> str:
 
 
 def restart(name: str, settings: str = "") -> str:
-    """Return the command that sets an interface down and up again, with settings that can only be changed then."""
+    """Return the command that sets an interface down and up again.
+
+    The settings can be changed only while the interface is down.
+    """
     return f"sudo ip link set {name} down; sudo ip link set {name} up {settings}".rstrip()
 
 

@@ -1,6 +1,7 @@
-"""What the kernel reports of one network interface by rtnetlink: whether it is there, up, and how its CAN controller is.
+"""Reads the state of one network interface and its CAN controller from the kernel by rtnetlink.
 
-Nothing is changed by it and no privilege is needed. Source of the numbers: linux/rtnetlink.h, if_link.h, can/netlink.h.
+It changes nothing and needs no privilege. The numbers are defined in linux/rtnetlink.h,
+linux/if_link.h and linux/can/netlink.h.
 """
 
 import contextlib
@@ -13,44 +14,65 @@ from typing import NamedTuple
 
 from kontronik_can_gw.status import CanState
 
-_ROUTE, _LINK_GROUP = 0, 1
+_ROUTE = 0
+_LINK_GROUP = 1
 _HEADER = struct.Struct("=IHHII")
 _INTERFACE = struct.Struct("=BxHiII")
 _ATTRIBUTE = struct.Struct("=HH")
-_NEW_LINK, _DELETED_LINK, _GET_LINK, _ERROR = 16, 17, 18, 2
+# Types of messages
+_ERROR = 2
+_NEW_LINK = 16
+_DELETED_LINK = 17
+_GET_LINK = 18
 _REQUEST = 1
 _UP = 0x1
 _RUNS = 0x40 | 0x10000
-"""IFF_RUNNING, which the kernel may report a second late, and IFF_LOWER_UP: the controller is on."""
-_NAME, _LINK_INFO, _INFO_KIND, _INFO_DATA = 3, 18, 1, 2
-_BIT_TIMING, _STATE, _RESTART_MS, _ERROR_COUNTERS = 1, 4, 6, 8
-_EXT_MASK, _WITHOUT_STATISTICS = 29, struct.pack("=I", 8)
-"""What is left out of an answer: counters of traffic. Without them it is the same as before, as a rule."""
+"""IFF_RUNNING, which the kernel may report a second late, and IFF_LOWER_UP (controller is on)."""
+# Attributes of an interface
+_NAME = 3
+_LINK_INFO = 18
+_EXT_MASK = 29
+_WITHOUT_STATISTICS = struct.pack("=I", 8)
+"""Omits the traffic counters, so that most answers are identical to the one before."""
+# Attributes in _LINK_INFO
+_INFO_KIND = 1
+_INFO_DATA = 2
+# Attributes in _INFO_DATA of a CAN interface
+_BIT_TIMING = 1
+_STATE = 4
+_RESTART_MS = 6
+_ERROR_COUNTERS = 8
 _TYPE_MASK = 0x3FFF
 _BUFFER = 1 << 16
 _STATES = (CanState.ERROR_ACTIVE, CanState.ERROR_WARNING, CanState.ERROR_PASSIVE, CanState.BUS_OFF)
 
 
 class LinkFacts(NamedTuple):
-    """An interface as the kernel knows it. ``state`` is None where there is no controller (vcan) or it does not run.
-
-    ``bitrate`` in bit/s, ``restart_ms`` 0: a controller in bus-off stays there; None where the driver does not report it.
-    """
+    """The kernel's report on an interface. A field is None if the driver does not report it."""
 
     exists: bool
     up: bool = False
     kind: str = ""
     state: CanState | None = None
+    """State of the controller. None if it does not run, or if there is no controller (vcan)."""
     bitrate: int | None = None
+    """Bit rate in bit/s."""
     restart_ms: int | None = None
+    """Time from bus-off to an automatic restart. 0: the controller stays in bus-off."""
     error_counters: tuple[int, int] | None = None
     """Transmit and receive error counter of the controller."""
     running: bool = True
-    """False while what is sent is dropped unseen: the controller is off, or its queue not started again."""
+    """False if sent frames are lost without an error.
+
+    The controller is off, or its queue has not been started again.
+    """
 
 
 class LinkMonitor:
-    """Receives every change of one interface; asks for what is not reported unasked. OSError where the system has no rtnetlink."""
+    """Receives the kernel's reports on one interface, and asks for values not reported unasked.
+
+    Raises OSError if the system has no rtnetlink.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name.encode()
@@ -58,10 +80,9 @@ class LinkMonitor:
         body += _attribute(_EXT_MASK, _WITHOUT_STATISTICS)
         self._question = _HEADER.pack(_HEADER.size + len(body), _GET_LINK, _REQUEST, 0, 0) + body
         self._heard: tuple[bytes, list[LinkFacts]] = b"", []
-        """The last datagram and what it says."""
-        self._socket = socket.socket(
-            socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC, _ROUTE
-        )
+        """The last datagram and its reports, because most answers are identical."""
+        kind = socket.SOCK_RAW | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
+        self._socket = socket.socket(socket.AF_NETLINK, kind, _ROUTE)
         try:
             self._socket.bind((0, _LINK_GROUP))
         except OSError:
@@ -72,12 +93,12 @@ class LinkMonitor:
         return self._socket.fileno()
 
     def ask(self) -> None:
-        """Let the kernel report how the interface is now: ``take`` gives the answer, at once."""
+        """Ask the kernel for the present state. ``take`` returns the answer immediately."""
         with contextlib.suppress(OSError):
             self._socket.send(self._question)
 
     def take(self) -> list[LinkFacts]:
-        """What was reported of the interface since the last call, oldest first."""
+        """Return the reports on the interface since the last call, oldest first."""
         found: list[LinkFacts] = []
         while True:
             try:
@@ -87,11 +108,11 @@ class LinkMonitor:
             except OSError as error:
                 if error.errno != errno.ENOBUFS:
                     return found
-                self.ask()  # more was reported than we read: what counts is how it is now
+                self.ask()  # reports were lost, so the present state is needed
                 continue
             if data != self._heard[0]:
                 facts = [self._facts(kind, body) for kind, body in _messages(data)]
-                self._heard = data, [each for each in facts if each is not None]
+                self._heard = (data, [each for each in facts if each is not None])
             found += self._heard[1]
 
     def close(self) -> None:
@@ -100,7 +121,9 @@ class LinkMonitor:
     def _facts(self, kind: int, body: bytes) -> LinkFacts | None:
         if kind == _ERROR and len(body) >= 4:
             (code,) = struct.unpack_from("=i", body)
-            return LinkFacts(exists=False) if -code in (errno.ENODEV, errno.ENXIO) else None
+            if -code in (errno.ENODEV, errno.ENXIO):
+                return LinkFacts(exists=False)
+            return None
         if kind not in (_NEW_LINK, _DELETED_LINK) or len(body) < _INTERFACE.size:
             return None
         attributes = _attributes(body, _INTERFACE.size)
@@ -110,25 +133,22 @@ class LinkMonitor:
             return LinkFacts(exists=False)
         flags = _INTERFACE.unpack_from(body)[3]
         info = _attributes(attributes.get(_LINK_INFO, b""))
+        link_kind = info.get(_INFO_KIND, b"").rstrip(b"\0")
         can = _attributes(info.get(_INFO_DATA, b""))
-        state = _number(can.get(_STATE))
-        counters = can.get(_ERROR_COUNTERS)
         return LinkFacts(
-            True,
-            bool(flags & _UP),
-            info.get(_INFO_KIND, b"").rstrip(b"\0").decode("ascii", "replace"),
-            _STATES[state] if state is not None and state < len(_STATES) else None,
-            _number(can.get(_BIT_TIMING)),
-            _number(can.get(_RESTART_MS)),
-            struct.unpack_from("=HH", counters)
-            if counters is not None and len(counters) >= 4
-            else None,
-            flags & _RUNS == _RUNS,
+            exists=True,
+            up=bool(flags & _UP),
+            kind=link_kind.decode("ascii", "replace"),
+            state=_state(can.get(_STATE)),
+            bitrate=_number(can.get(_BIT_TIMING)),
+            restart_ms=_number(can.get(_RESTART_MS)),
+            error_counters=_counters(can.get(_ERROR_COUNTERS)),
+            running=flags & _RUNS == _RUNS,
         )
 
 
 def link_monitor(name: str) -> LinkMonitor | None:
-    """A monitor; None where the system does not offer one."""
+    """Return a monitor for an interface, or None if the system has no rtnetlink."""
     try:
         return LinkMonitor(name)
     except OSError:
@@ -136,9 +156,23 @@ def link_monitor(name: str) -> LinkMonitor | None:
 
 
 def _number(value: bytes | None) -> int | None:
-    return (
-        int.from_bytes(value[:4], sys.byteorder) if value is not None and len(value) >= 4 else None
-    )
+    if value is None or len(value) < 4:
+        return None
+    return int.from_bytes(value[:4], sys.byteorder)
+
+
+def _state(value: bytes | None) -> CanState | None:
+    number = _number(value)
+    if number is None or number >= len(_STATES):
+        return None
+    return _STATES[number]
+
+
+def _counters(value: bytes | None) -> tuple[int, int] | None:
+    if value is None or len(value) < 4:
+        return None
+    transmit, receive = struct.unpack_from("=HH", value)
+    return transmit, receive
 
 
 def _attribute(kind: int, value: bytes) -> bytes:
@@ -146,7 +180,7 @@ def _attribute(kind: int, value: bytes) -> bytes:
 
 
 def _messages(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(type, body) of each netlink message in a datagram."""
+    """Yield type and body of each netlink message in a datagram."""
     while len(data) >= _HEADER.size:
         size, kind = _HEADER.unpack_from(data)[:2]
         if not _HEADER.size <= size <= len(data):
@@ -155,13 +189,13 @@ def _messages(data: bytes) -> Iterator[tuple[int, bytes]]:
         data = data[size + (-size % 4) :]
 
 
-def _attributes(data: bytes, at: int = 0) -> dict[int, bytes]:
-    """The attributes from a place on, by their type."""
+def _attributes(data: bytes, offset: int = 0) -> dict[int, bytes]:
+    """Return the attributes that begin at an offset, by their type."""
     found = {}
-    while at + _ATTRIBUTE.size <= len(data):
-        size, kind = _ATTRIBUTE.unpack_from(data, at)
-        if not _ATTRIBUTE.size <= size <= len(data) - at:
+    while offset + _ATTRIBUTE.size <= len(data):
+        size, kind = _ATTRIBUTE.unpack_from(data, offset)
+        if not _ATTRIBUTE.size <= size <= len(data) - offset:
             break
-        found[kind & _TYPE_MASK] = data[at + _ATTRIBUTE.size : at + size]
-        at += size + (-size % 4)
+        found[kind & _TYPE_MASK] = data[offset + _ATTRIBUTE.size : offset + size]
+        offset += size + (-size % 4)
     return found

@@ -1,9 +1,9 @@
-"""Opens the CAN interface of the configuration: SocketCAN through a socket of our own, others through python-can.
+"""Opens the CAN interface of the configuration: SocketCAN by a raw socket, others by python-can.
 
 The drivers of python-can have no descriptor to wait on. A thread receives from them and hands the
 frames over through a bounded queue with a descriptor. ``_read`` and ``_fail`` run in that thread,
-everything else in the loop's. Both sides share ``_ids``, ``_failed`` and ``_dropped`` (each written
-by one side only), the queue, and ``_own_frames``, which has a lock.
+everything else in the loop's thread. The threads share ``_ids``, ``_failed`` and ``_dropped`` (each
+written by one side only), the queue, and ``_own_frames``, which has a lock.
 """
 
 import contextlib
@@ -41,11 +41,11 @@ _MAX_END_S = 1.0
 _RETURNING_OWN_FRAMES = ("udp_multicast",)
 """Interfaces that return each sent frame as if another device had sent it."""
 _RETURN_LIMIT_NS = 10 * SECOND
-"""A sent frame that has not been returned by then was lost."""
+"""A sent frame that has not been returned within this time was lost."""
 
 
 def check_interface(config: CanConfig) -> None:
-    """UserError for an interface that python-can does not know."""
+    """Raise UserError if python-can does not have the interface."""
     if config.interface == "socketcan":
         if config.options:
             log.warning("can.options: SocketCAN takes none, they are ignored. Leave them out.")
@@ -58,7 +58,7 @@ def check_interface(config: CanConfig) -> None:
 
 
 def open_can(config: CanConfig) -> CanPort:
-    """Open an interface. RunError with one clear line where it cannot be opened, or is down."""
+    """Open an interface. Raises RunError with the remedy if it is down or cannot be opened."""
     if config.interface == "socketcan":
         return open_socketcan(config)
     check_interface(config)
@@ -72,17 +72,18 @@ def open_can(config: CanConfig) -> CanPort:
     try:
         bus = can.Bus(interface=config.interface, channel=config.channel, **options)
         return DriverPort(bus, own_frames)
-    except Exception as error:  # each of python-can's drivers fails in its own ways, a missing vendor library as NameError
+    except Exception as error:
+        # The drivers raise exceptions of any kind, for example NameError if a library is missing.
         raise RunError(
             f"CAN {config.interface} {config.channel}: cannot be opened: {error}"
         ) from None
 
 
 class OwnFrames:
-    """Recognizes frames of ours that the interface returns. Safe to use in two threads.
+    """Recognizes our own frames when the interface returns them. Two threads may use it.
 
     Each sent frame is expected back once. Another device that sends an identical frame is still
-    noticed, because that frame arrives once more.
+    noticed, because that frame arrives a second time.
     """
 
     def __init__(self) -> None:
@@ -91,18 +92,18 @@ class OwnFrames:
         """Times of sending and frames, oldest first."""
 
     def add(self, frame: CanFrame, now: int) -> None:
-        """Expects a frame back. Call it before the frame is sent: the other thread may be faster."""
+        """Expect a frame back. Call it before sending, because the other thread may be faster."""
         with self._lock:
             while self._expected and now - self._expected[0][0] > _RETURN_LIMIT_NS:
                 self._expected.popleft()
             self._expected.append((now, _as_received(frame)))
 
     def discard(self, frame: CanFrame) -> None:
-        """No longer expects the frame: it could not be sent."""
+        """No longer expect a frame, because it could not be sent."""
         self.is_own(frame)
 
     def is_own(self, frame: CanFrame) -> bool:
-        """Whether a received frame is one of ours. Returns True once for each sent frame."""
+        """Return True if a received frame is our own. Returns True once for each sent frame."""
         received = _as_received(frame)
         with self._lock:
             for index, (_, expected) in enumerate(self._expected):
@@ -113,14 +114,15 @@ class OwnFrames:
 
 
 def _as_received(frame: CanFrame) -> CanFrame:
-    """The frame without the fields that are not on the bus."""
+    """Return the frame without the fields that are not on the bus."""
     return CanFrame(frame.can_id, frame.data, frame.extended, frame.fd)
 
 
 class DriverPort(CanPort):
-    """A bus of python-can, read by a thread from the first id to receive until ``close`` or a failure.
+    """A bus of python-can, read by a thread.
 
-    ``own_frames``: given for an interface that returns the frames sent through it.
+    The thread runs from the first call with an id to receive until ``close`` or a failure.
+    ``own_frames`` is given for an interface that returns the frames sent through it.
     """
 
     def __init__(self, bus: "can.BusABC", own_frames: OwnFrames | None = None) -> None:
@@ -130,21 +132,23 @@ class DriverPort(CanPort):
         self._worker: Worker[None] | None = None
         self._frames: Handover[tuple[CanFrame, int | None]] = Handover(QUEUE_LENGTH)
         self._dropped = 0
-        """Frames that came while the queue was full."""
+        """Number of frames received while the queue was full."""
         self._failed = False
-        """The thread has ended; the descriptor became readable."""
+        """True if the thread has ended after a failure. The descriptor became readable."""
 
     def fileno(self) -> int | None:
         return None if self._worker is None else self._frames.fileno()
 
     def close(self) -> None:
-        """It takes as long as one wait of the driver. A thread that a driver holds is left running, without effect."""
+        """Close the port. It takes as long as one wait of the driver.
+
+        A thread whose driver does not return keeps running, without effect.
+        """
         if self._worker is not None:
-            # before the driver is shut down: few of them bear both at once
+            # The thread must end first: few drivers can be read and shut down at the same time.
             self._worker.stop(_MAX_END_S)
         self._frames.close()
-        with contextlib.suppress(Exception):
-            # an interface that is gone may fail in its own ways; nothing is left to do
+        with contextlib.suppress(Exception):  # a removed interface may raise any exception
             self._bus.shutdown()
 
     def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
@@ -161,20 +165,24 @@ class DriverPort(CanPort):
         self._filter_bus()
         if self._worker is None:
             self._worker = Worker("can-reader", self._read, failed=self._fail, wait=lambda: None)
-            self._failed = not self._worker.start()  # so that it is tried again with another one
+            # If there is no thread now, the port counts as failed, and is opened again later.
+            self._failed = not self._worker.start()
 
     def _filter_bus(self) -> None:
-        """Ask the driver for our ids; one that cannot filter is left to the thread."""
-        filters: can.typechecking.CanFilters = [
-            {
-                "can_id": key & MAX_EXTENDED_ID,
-                "can_mask": mask & (MAX_EXTENDED_ID if key & EXTENDED else MAX_STANDARD_ID),
-                "extended": bool(key & EXTENDED),
-            }
-            for key, mask in map(id_and_mask, sorted(self._ids))
-        ]
+        """Set the driver's filter to our ids. If it cannot filter, the thread does."""
+        filters: list[can.typechecking.CanFilter] = []
+        for key, mask in map(id_and_mask, sorted(self._ids)):
+            is_extended = bool(key & EXTENDED)
+            id_bits = MAX_EXTENDED_ID if is_extended else MAX_STANDARD_ID
+            filters.append(
+                {
+                    "can_id": key & MAX_EXTENDED_ID,
+                    "can_mask": mask & id_bits,
+                    "extended": is_extended,
+                }
+            )
         for wanted in (filters, None):
-            with contextlib.suppress(Exception):  # each driver fails in its own way
+            with contextlib.suppress(Exception):  # drivers raise exceptions of any kind
                 self._bus.set_filters(wanted)
                 return
         self.gone = True
@@ -219,11 +227,11 @@ class DriverPort(CanPort):
         except can.CanError:
             return Sent.BUSY
         except Exception:
-            # what a driver lets out when its adapter has gone: OSError, termios.error ...
+            # Drivers raise for example OSError or termios.error if the adapter was removed.
             return Sent.GONE
         return Sent.OK
 
-    # --- the thread's side
+    # --- in the thread
 
     def _read(self, _items: list[None]) -> None:
         assert self._worker is not None
@@ -232,16 +240,16 @@ class DriverPort(CanPort):
         message = self._bus.recv(_POLL_S)
         if message is None or not self._wanted(message):
             return
-        data, extended = bytes(message.data), message.is_extended_id
-        frame = CanFrame(message.arbitration_id, data, extended, message.is_fd)
+        data = bytes(message.data)
+        frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
         if self._own_frames is not None and self._own_frames.is_own(frame):
             return
-        # drivers count ``timestamp`` from different origins
+        # The origin of ``message.timestamp`` depends on the driver, so it is not used.
         if not self._frames.put((frame, time.monotonic_ns())):
             self._dropped += 1
 
     def _fail(self, error: Exception) -> None:
-        """What a driver lets out when its adapter has gone: CanError, OSError, TypeError ..."""
+        """End the thread after an exception of the driver, for example of a removed adapter."""
         assert self._worker is not None
         if not self._worker.is_ending:
             log.debug("CAN: receiving failed: %r", error)
@@ -250,10 +258,8 @@ class DriverPort(CanPort):
         self._worker.end()
 
     def _wanted(self, message: "can.Message") -> bool:
-        """A data frame with one of our ids, not sent by ourselves."""
-        return (
-            self._is_wanted(message.arbitration_id | (EXTENDED if message.is_extended_id else 0))
-            and not message.is_remote_frame
-            and not message.is_error_frame
-            and message.is_rx
-        )
+        """Return True for a data frame with one of our ids that we did not send."""
+        if message.is_remote_frame or message.is_error_frame or not message.is_rx:
+            return False
+        flag = EXTENDED if message.is_extended_id else 0
+        return self._is_wanted(message.arbitration_id | flag)

@@ -1,4 +1,7 @@
-"""SocketCAN without waiting: a raw socket, its filters, error frames and answers; why an interface cannot be used."""
+"""Sends and receives through a raw SocketCAN socket, without waiting.
+
+It also finds the reason why an interface cannot be used.
+"""
 
 import contextlib
 import errno
@@ -30,9 +33,15 @@ from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import SECOND
 
 _RECEIVE_BUFFER = 1 << 20
-"""Bytes asked for; the kernel grants what net.core.rmem_max allows, by default twice the usual 278 frames."""
+"""Size in bytes that is requested. The kernel limits it to net.core.rmem_max.
+
+By default, the socket then holds twice the usual 278 frames.
+"""
 _SEND_BUFFER = 1
-"""Bytes asked for; the kernel gives its minimum, about six frames: what waits in there cannot be overtaken by newer values."""
+"""Size in bytes that is requested. The kernel grants its minimum, about six frames.
+
+Newer values cannot replace frames in this buffer, so it should be short.
+"""
 
 _CLASSIC = struct.Struct("=IB3x8s")
 _FD = struct.Struct("=IBB2x64s")
@@ -41,16 +50,25 @@ _REMOTE = 0x40000000
 _ERROR_FLAG = 0x20000000
 _FILTER = struct.Struct("=II")
 _MAX_FILTERS = 512
-"""CAN_RAW_FILTER_MAX: the kernel takes no more for one socket."""
-_ERR_CONTROLLER, _ERR_BUS_OFF, _ERR_RESTARTED = 0x04, 0x40, 0x100
-_CTRL_RX_OVERFLOW, _CTRL_WARNING, _CTRL_PASSIVE, _CTRL_ACTIVE = 0x01, 0x0C, 0x30, 0x40
+"""CAN_RAW_FILTER_MAX, the kernel's limit for one socket."""
+# Classes of error frames (linux/can/error.h)
+_ERR_CONTROLLER = 0x04
+_ERR_BUS_OFF = 0x40
+_ERR_RESTARTED = 0x100
+# Details of _ERR_CONTROLLER
+_CTRL_RX_OVERFLOW = 0x01
+_CTRL_WARNING = 0x0C
+_CTRL_PASSIVE = 0x30
+_CTRL_ACTIVE = 0x40
 _OK = Sent.OK
 _CAN_RAW_ERR_FILTER = 2
-_SO_TIMESTAMPNS, _TIME = 64, struct.Struct("=qq")
-"""Times of reception. Kernels before 5.1 have none of this form: there the time of the read counts."""
+_SO_TIMESTAMPNS = 64
+"""Requests times of reception. Kernels before 5.1 do not have it: the time of the read is used."""
+_TIME = struct.Struct("=qq")
 _ANCILLARY_SIZE = 64
-_SO_MEMINFO, _MEMINFO = 55, struct.Struct("=9I")
-"""The kernel's figures of a socket; the last one counts what it dropped for want of room."""
+_SO_MEMINFO = 55
+"""Requests the kernel's figures of a socket. The last one counts frames dropped by a full queue."""
+_MEMINFO = struct.Struct("=9I")
 
 
 class SocketCanPort(CanPort):
@@ -61,7 +79,7 @@ class SocketCanPort(CanPort):
     def __init__(self, opened: socket.socket) -> None:
         super().__init__()
         self._socket = opened
-        # until ids are asked for only error frames (the socket asks for them) wake the process
+        # Until ``set_receive_ids`` is called, only error frames wake the process.
         opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
         opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 0)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
@@ -80,7 +98,7 @@ class SocketCanPort(CanPort):
         packed = b"".join(_FILTER.pack(*each) for each in kernel_filters(self._ids))
         try:
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed)
-        except OSError:  # of an interface that was removed a moment ago
+        except OSError:  # the interface was removed
             self.gone = True
 
     def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
@@ -106,19 +124,19 @@ class SocketCanPort(CanPort):
             if can_id & _ERROR_FLAG:
                 self._follow(can_id, content[1])
             elif self._is_wanted(can_id):
-                # with another flag set, of a remote frame, it is none of ours
+                # The flag of a remote frame is a part of ``can_id``, so such a frame is not wanted.
                 frame = CanFrame(can_id & ~EXTENDED, content[:size], bool(can_id & EXTENDED), is_fd)
                 frames.append((frame, _monotonic(ancillary)))
         else:
             self.drained = False
-            self._note_drops()  # there was more than we take at once: perhaps more than the kernel holds
+            self._note_drops()  # so many frames may have overflowed the kernel's queue
         return frames
 
     def _drops(self) -> int:
         try:
             found = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
             return int(_MEMINFO.unpack(found)[-1])
-        except (OSError, struct.error):  # an old kernel, which has fewer figures
+        except (OSError, struct.error):  # an old kernel has fewer figures
             return 0
 
     def _follow(self, can_id: int, detail: int) -> None:
@@ -139,7 +157,9 @@ class SocketCanPort(CanPort):
     def _send_each(
         self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
     ) -> tuple[int, Sent]:
-        send, pack, count = self._socket.send, _CLASSIC.pack, 0
+        send = self._socket.send
+        pack = _CLASSIC.pack
+        count = 0
         for can_id, data, extended, fd, _, remote, _ in frames:
             if clock() > latest:
                 return count, Sent.LATE
@@ -161,7 +181,11 @@ class SocketCanPort(CanPort):
         return count, _OK
 
     def _send_again(self, packed: bytes, refused: OSError) -> Sent:
-        """What a refusal means. An interface that was down and is up again reports its old error once: then the frame is sent."""
+        """Return the result of a refused frame.
+
+        An interface that was down and is up again reports its old error once. In this case the
+        frame is sent again.
+        """
         answer = _meaning(refused)
         if answer is not Sent.DOWN:
             return answer
@@ -173,7 +197,7 @@ class SocketCanPort(CanPort):
 
 
 def _monotonic(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
-    """The time of reception that came with a frame, on the monotonic clock."""
+    """Return a frame's time of reception on the monotonic clock, or None if it is unknown."""
     for level, kind, data in ancillary:
         if (level, kind, len(data)) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS, _TIME.size):
             seconds, ns = _TIME.unpack(data)
@@ -182,59 +206,72 @@ def _monotonic(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
 
 
 def _meaning(error: OSError) -> Sent:
-    """What it says that the kernel did not take a frame."""
+    """Return the result for a frame that the kernel refused with this error."""
     if error.errno == errno.EAGAIN:
         return Sent.FULL
     if error.errno in (errno.ENOBUFS, errno.ENOMEM):
         return Sent.BUSY
-    return Sent.GONE if error.errno in (errno.ENXIO, errno.ENODEV, errno.EBADF) else Sent.DOWN
+    if error.errno in (errno.ENXIO, errno.ENODEV, errno.EBADF):
+        return Sent.GONE
+    return Sent.DOWN
 
 
 def kernel_filters(ids: frozenset[int]) -> list[tuple[int, int]]:
-    """(id, mask) pairs that let these data frames through; with too many ids blocks of 2, 4 ... of which one is wanted.
+    """Return the (id, mask) pairs of a filter that lets data frames with these ids pass.
 
-    The flags are part of the mask, so that remote frames, and those of the other length, with the same number stay out.
+    If there are too many ids, each pair lets a block of 2, 4, 8 or more ids pass that contains at
+    least one of them. The flags are a part of the mask. So remote frames, and frames of the other
+    id length with the same number, do not pass.
     """
-    step, flags = 1, EXTENDED | _REMOTE
-    found = [id_and_mask(each) for each in sorted(ids) if each >> 32]
-    found = [(first, flags | mask & MAX_EXTENDED_ID) for first, mask in found]
+    flags = EXTENDED | _REMOTE
+    wanted_blocks = [id_and_mask(each) for each in sorted(ids) if each >> 32]
+    found = [(first, flags | mask & MAX_EXTENDED_ID) for first, mask in wanted_blocks]
     ids = frozenset(each for each in ids if not each >> 32)
+    step = 1
     while len({can_id // step for can_id in ids}) > _MAX_FILTERS - len(found):
         step *= 2
-    blocks, low = sorted({can_id // step * step for can_id in ids}), step - 1
-    return found + [
-        (first, flags | (MAX_EXTENDED_ID if first & EXTENDED else MAX_STANDARD_ID) & ~low)
-        for first in blocks
-    ]
+    low_bits = step - 1
+    for first in sorted({can_id // step * step for can_id in ids}):
+        id_bits = MAX_EXTENDED_ID if first & EXTENDED else MAX_STANDARD_ID
+        found.append((first, flags | id_bits & ~low_bits))
+    return found
 
 
 def fault_of(name: str) -> int:
-    """Why a network interface cannot be used, as in errno: ENODEV, ENETDOWN; 0 where it is up or there is no way to know."""
+    """Return the reason why a network interface cannot be used, as errno: ENODEV or ENETDOWN.
+
+    0 if the interface is up, or if the reason is unknown.
+    """
     interfaces = Path("/sys/class/net")
     try:
-        return 0 if int((interfaces / name / "flags").read_text(), 16) & 1 else errno.ENETDOWN
+        flags = int((interfaces / name / "flags").read_text(), 16)
     except OSError:
-        return (
-            errno.ENODEV if (interfaces / "lo").exists() and not (interfaces / name).exists() else 0
-        )
+        is_missing = (interfaces / "lo").exists() and not (interfaces / name).exists()
+        return errno.ENODEV if is_missing else 0
     except ValueError:
         return 0
+    return 0 if flags & 1 else errno.ENETDOWN
 
 
 def open_socketcan(config: CanConfig) -> SocketCanPort:
-    """Open an interface by a socket of our own: without 8 MB and 80 ms of python-can. RunError where that fails, or where it is down."""
+    """Open an interface without python-can, which would take 8 MB and 80 ms.
+
+    Raises RunError with the remedy if that fails, or if the interface is down.
+    """
     name = config.channel
     mtu = Path("/sys/class/net", name, "mtu")
     if config.fd and mtu.exists() and int(mtu.read_text()) < _FD.size:
         command = enable_fd(config, kind_of(name))
         raise RunError(
-            f"CAN interface {name}: CAN FD is not switched on. Switch it on: {command}; or set can.fd = false."
+            f"CAN interface {name}: CAN FD is not switched on. "
+            f"Switch it on: {command}; or set can.fd = false."
         )
     try:
         with contextlib.ExitStack() as undone:
             opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
             undone.enter_context(opened)
-            if number := fault_of(name):
+            number = fault_of(name)
+            if number:
                 raise OSError(number, os.strerror(number))
             if config.fd:
                 opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
@@ -245,12 +282,15 @@ def open_socketcan(config: CanConfig) -> SocketCanPort:
             return port
     except OSError as error:
         raise socketcan_error(config, error.errno or 0, error.strerror or str(error)) from None
-    except AttributeError:  # a Python that was built without it
+    except AttributeError:  # this Python was built without SocketCAN
         raise socketcan_error(config, errno.EAFNOSUPPORT) from None
 
 
 def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
-    """Return the error for an interface that cannot be used, with the remedy. ``number`` as in errno."""
+    """Return the error for an interface that cannot be used, with the remedy.
+
+    ``number`` is an errno. ``text`` describes errors for which there is no remedy.
+    """
     name = config.channel
     if number in (errno.ENODEV, errno.ENXIO):
         kind = kind_of(name)
@@ -258,12 +298,14 @@ def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
         if kind in VIRTUAL:
             return RunError(f"CAN interface {name}: there is none. Create it: {virtual}.")
         return RunError(
-            f"CAN interface {name}: there is none. With an adapter plugged in: {set_up(config, kind)}. "
+            f"CAN interface {name}: there is none. "
+            f"With an adapter plugged in: {set_up(config, kind)}. "
             f"For a virtual one: {virtual}."
         )
     if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
         return RunError(
-            f"CAN interface {name}: this kernel has no SocketCAN. Try: sudo modprobe -a can_raw vcan."
+            f"CAN interface {name}: this kernel has no SocketCAN. "
+            "Try: sudo modprobe -a can_raw vcan."
         )
     if number == errno.ENETDOWN:
         command = set_up(config, kind_of(name))

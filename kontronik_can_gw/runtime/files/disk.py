@@ -1,4 +1,4 @@
-"""What the threads that write files have in common."""
+"""Functions for the threads that write files."""
 
 import fcntl
 import os
@@ -6,14 +6,17 @@ from pathlib import Path
 
 
 def write_all(fd: int, data: bytes) -> None:
-    """Write all of it, however little the system takes at a time."""
+    """Write all the data, in as many steps as the system needs."""
     rest = memoryview(data)
     while rest:
         rest = rest[os.write(fd, rest) :]
 
 
 def write_new(path: Path, data: bytes, mode: int, is_synced: bool = False) -> None:
-    """Write a new file with these permissions, in place of a left-over one; ``is_synced``: its content is on disk then. Or OSError."""
+    """Write a new file with these permissions. An old file of that name is replaced.
+
+    With ``is_synced``, the content is forced to the disk. Raises OSError if that fails.
+    """
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
     try:
         fd = os.open(path, flags, mode)
@@ -21,7 +24,7 @@ def write_new(path: Path, data: bytes, mode: int, is_synced: bool = False) -> No
         path.unlink()
         fd = os.open(path, flags, mode)
     try:
-        os.fchmod(fd, mode)  # whatever the umask
+        os.fchmod(fd, mode)  # os.open applies the umask to the mode
         write_all(fd, data)
         if is_synced:
             os.fsync(fd)
@@ -30,7 +33,10 @@ def write_new(path: Path, data: bytes, mode: int, is_synced: bool = False) -> No
 
 
 def sync_folder(folder: Path) -> None:
-    """Force the names in a folder to the disk. OSError where that fails, as on a file system that cannot."""
+    """Force the names in a folder to the disk.
+
+    Raises OSError if that fails, for example if the file system does not support it.
+    """
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)
@@ -39,15 +45,17 @@ def sync_folder(folder: Path) -> None:
 
 
 def reason_of(error: Exception) -> str:
-    """Why it failed, for a log line."""
-    return error.strerror or str(error) if isinstance(error, OSError) else repr(error)
+    """Return the reason of a failure as text for a log line."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return repr(error)
 
 
 def is_locked(path: Path) -> bool:
-    """True for a file that somebody has locked (flock), here or in another process."""
+    """Return True if this or another process has locked the file with flock."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    except OSError:  # it has gone
+    except OSError:  # the file was removed
         return False
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Parameters on their way from the nodes to the store, and what became of them on the way back."""
+"""Hands the nodes' parameters to the store, and returns the results to the nodes."""
 
 import logging
 from collections.abc import Sequence
@@ -15,7 +15,10 @@ log = logging.getLogger("kontronik_can_gw")
 
 
 class ParameterSaver:
-    """Hands savings to the store's thread, in their order (a node has a few at most); ``store`` None: each is answered with an error."""
+    """Hands savings to the store's thread in their order. A node has only a few at a time.
+
+    If ``store`` is None, every saving fails.
+    """
 
     def __init__(
         self, gateway: Gateway, escs: Sequence[EscPort], store: "ParameterStore | None"
@@ -36,10 +39,13 @@ class ParameterSaver:
                 self._take(index, "no store", now)
 
     def take_results(self, now: int, _events: int = 0) -> None:
-        """The store has something to report: pass it on."""
-        for name, error in self._store.results() if self._store is not None else ():
+        """Return the store's results to the nodes. Call it when they are readable."""
+        if self._store is None:
+            return
+        names = [esc.name for esc in self._escs]
+        for name, error in self._store.results():
             self._waiting -= 1
-            self._take([esc.name for esc in self._escs].index(name), error, now)
+            self._take(names.index(name), error, now)
 
     def _take(self, index: int, error: str | None, now: int) -> None:
         name = self._escs[index].name
@@ -51,5 +57,7 @@ class ParameterSaver:
         self._gateway.saved(index, error, now)
 
     def facts(self) -> StoreFacts | None:
-        """For the statistics; None without a store."""
-        return None if self._store is None else StoreFacts(self._waiting, self._last_error)
+        """Return the state of the store for the status document. None without a store."""
+        if self._store is None:
+            return None
+        return StoreFacts(self._waiting, self._last_error)

@@ -1,9 +1,13 @@
-"""Captures of a running gateway: a folder of .kcap files (capture/format.py), written by a thread.
+"""Captures a running gateway: a thread writes .kcap files (capture/format.py) to a folder.
 
-What may touch what: ``put``, ``note`` and ``reports`` are called by the loop's thread and never wait; only ``_work`` and
-what it calls touch the disk. Entries go from one to the other by a deque with a bound: what finds no room is counted, and the count is
-recorded when there is room again. Each half second what has come is one block, forced to the disk: a loss of power costs that and no more.
-A fault of the disk is reported once, tried again each five seconds, and never ends the gateway nor the recorder.
+``put``, ``note`` and ``reports`` are called by the loop's thread and never wait. Only ``_work``, in
+the recorder's thread, and the functions that it calls access the disk. Entries are handed over by a
+bounded deque. Entries that do not fit are counted, and the count is recorded as soon as there is
+room again.
+
+Every half second, the entries are written as one block and forced to the disk, so a loss of power
+costs no more than that. A fault of the disk is reported once and the disk is tried again every five
+seconds. It ends neither the gateway nor the recorder.
 """
 
 import contextlib
@@ -35,77 +39,100 @@ from kontronik_can_gw.runtime.system.worker import Report, Worker
 from kontronik_can_gw.times import MS, SECOND
 
 CAPACITY = 50_000
-"""Entries that may wait to be written: about two minutes of one ESC, 15 seconds of eight."""
+"""Maximum number of waiting entries: about two minutes of one ESC, or 15 seconds of eight."""
 PERIOD_S = 0.5
 _AT_ONCE = 5000
-"""Entries taken together, so that other threads have their turn between."""
+"""Number of entries processed together. Other threads can run between two such batches."""
 _CLOSE_S = 0.35
 _CHECK_NS = 5 * SECOND
-"""How often the folder is looked at, and a disk tried again that failed."""
+"""Interval between checks of the folder, and between attempts after a failure of the disk."""
 _CLOCK_NS = 10 * SECOND
+"""Interval between comparisons of the wall clock with the monotonic clock."""
 _STATE_NS = 2 * SECOND
+"""Interval between records of the gateway's state."""
 _STEP_NS = MS
+"""A larger change of the wall clock is recorded."""
 _SLOW_NS = 5 * SECOND
+"""A disk that takes longer is reported."""
 _MB = 1_000_000
 _OURS = re.compile(rf"[0-9]{{8}}T[0-9]{{6}}Z-[0-9a-f]{{6}}-[0-9]+{SUFFIX}")
 Item = tuple[int, int, int, bytes, int, int | None]
-"""(time, kind, ESC, data, flags, time of arrival), as of ``capture.Entry``."""
+"""(time, kind, ESC, data, flags, time of arrival), as in ``capture.Entry``."""
 
 
 @dataclass
 class RecorderFacts:
-    """How recording goes, for the statistics."""
+    """The state of the recording, for the status document."""
 
     file: str = ""
-    """The capture that is being written; empty while none is."""
+    """The capture that is being written. Empty if there is none."""
     bytes: int = 0
-    """Written since the start."""
+    """Number of bytes written since the start."""
     lost: int = 0
-    """Entries that were not recorded."""
+    """Number of entries that were not recorded."""
     problem: str = ""
 
 
 class Recorder:
-    """Writes what it is given from ``start`` until ``close``."""
+    """Writes the given entries to files, from ``start`` until ``close``."""
 
     def __init__(
         self, folder: Path, config: RecordConfig, clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self.facts = RecorderFacts()
         self.header: Mapping[str, Any] = {}
-        """What is known of gateway and ESCs, set before ``start``; a part's own numbers are added."""
+        """Description of the gateway and its ESCs. Set it before ``start``.
+
+        Each part of the capture adds its own numbers.
+        """
         self.words = str(folder)
-        """What is logged when it begins."""
-        self._folder, self._config = folder, config
+        """Text for the log line at the start."""
+        self._folder = folder
+        self._config = config
         self._clock = clock
         self._entries: deque[Item] = deque()
-        self._overflowed = self._reported_overflow = 0
-        """Entries that found no room: the loop's count."""
-        self._unwritten = self._recorded_losses = 0
-        """Entries that could not be written: the thread's count."""
-        self._state_ns = self._check_ns = self._clock_ns = self._offset = 0
+        self._overflowed = 0
+        """Number of entries that did not fit into the deque. Only the loop's thread counts them."""
+        self._reported_overflow = 0
+        self._unwritten = 0
+        """Number of entries that could not be written. Only the recorder's thread counts them."""
+        self._recorded_losses = 0
+        """Number of lost entries that the capture mentions."""
+        self._state_ns = 0
+        """Time of the last record of the gateway's state."""
+        self._check_ns = 0
+        """Time of the next check of the folder."""
+        self._clock_ns = 0
+        """Time of the last comparison of the clocks."""
+        self._offset = 0
+        """The wall clock's time minus the monotonic clock's, in ns, as last recorded."""
         self._devices: list[Any] = []
         self._recorded_devices: list[Any] = []
         self._worker: Worker[None] = Worker(
             "recorder", self._work, wait=self._wait, ended=self._end_part, clock=clock
         )
         self._is_usable = False
-        """The folder was, when it was last looked at."""
+        """True if the last check found that the folder can be used."""
         self._file: CapturePart | None = None
         self._run = os.urandom(8).hex()
         self._stamp = ""
         self._part = 0
 
-    # --- the loop's side
+    # --- in the loop's thread
 
     def start(self, wait: bool = False) -> None:
-        """Begin to write. RunError where the folder cannot be used, unless ``wait``: then it is tried again and again."""
+        """Start to write.
+
+        Raises RunError if the folder cannot be used. With ``wait``, the folder is instead tried
+        again every five seconds. Raises RunError if the system provides no thread.
+        """
         try:
             self._make_folder()
         except OSError as error:
             if not wait:
                 raise RunError(
-                    f"captures: {self._folder}: {error.strerror}. Give another folder (record.directory, --record)."
+                    f"captures: {self._folder}: {error.strerror}. "
+                    "Give another folder (record.directory, --record)."
                 ) from None
         if not self._worker.start():
             raise RunError("captures: the system gives no thread to write them")
@@ -113,47 +140,50 @@ class Recorder:
     def put(
         self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None
     ) -> None:
-        """Record an entry, as of ``capture.Entry``. Never waits."""
+        """Record an entry with the fields of ``capture.Entry``. Never waits."""
         if len(self._entries) >= CAPACITY:
             self._overflowed += 1
         else:
             self._entries.append((time_ns, kind, esc, data, flags, came_ns))
 
     def note(self, gateway: Gateway, now: int) -> None:
-        """How the gateway is now: what a replay of a later part begins with, and what is known of the devices."""
+        """Record the gateway's state and devices. A replay of a later part begins with them."""
         self._devices = devices_of(gateway)
         if now - self._state_ns >= _STATE_NS:
             self._state_ns = now
             self.put(now, Kind.STATE, 0, json_payload(state_of(gateway)), 0)
 
     def reports(self, now: int) -> list[Report]:
-        """Take what went wrong, or is right again, since the last call."""
+        """Return the begins and ends of faults since the last call."""
         taken = self._worker.reports(f"captures: {self._folder}", _SLOW_NS, now)
         if self._overflowed >= max(1, 2 * self._reported_overflow):
             self._reported_overflow = self._overflowed
-            text = f"captures: {self._overflowed} entries could not be recorded so far: the disk is too slow"
+            text = (
+                f"captures: {self._overflowed} entries could not be recorded so far: "
+                "the disk is too slow"
+            )
             taken.append(Report("captures: losses", True, text))
         self.facts.lost = self._overflowed + self._unwritten
         return taken
 
     def close(self) -> None:
-        """Write what waits and end the thread; a disk that does not answer is waited for 0.35 s and no longer."""
+        """Write the waiting entries and end the thread. Waits at most 0.35 s for the disk."""
         self._worker.stop(_CLOSE_S)
 
-    # --- the thread's side
+    # --- in the recorder's thread
 
     def _wait(self) -> None:
         self._worker.pause(PERIOD_S)
 
     def _work(self, _items: list[None]) -> None:
-        """Write what has come."""
+        """Write the waiting entries."""
         entries = self._entries
         while True:
             items = [entries.popleft() for _ in range(min(_AT_ONCE, len(entries)))]
             now = self._clock()
             try:
                 self._write(items, now)
-            except Exception as error:  # a mistake of ours is no reason to end either
+            except Exception as error:  # a bug must not end the recorder either
                 self._unwritten += len(items)
                 self._fail(error, now)
             if not entries or self._file is None:
@@ -165,13 +195,15 @@ class Recorder:
         if not self._is_usable:
             self._unwritten += len(items)
             return
-        file = self._file = self._file or self._new_part(items[0][0] if items else now)
+        if self._file is None:
+            self._file = self._new_part(items[0][0] if items else now)
+        file = self._file
         if self._devices != self._recorded_devices:
             self._recorded_devices = self._devices
             file.write(b"I", json_payload({"devices": self._recorded_devices}))
         if items:
-            self._remark(items, now)
-            file.take(items)
+            self._append_remarks(items, now)
+            file.append(items)
         self.facts.bytes += file.sync()
         self.facts.file = str(file.path)
         if self.facts.problem:
@@ -181,12 +213,18 @@ class Recorder:
             self._end_part()
 
     def _check(self, now: int) -> None:
-        """Whether something may be written to the folder from now on. OSError where it cannot be used."""
-        self._check_ns, self._is_usable = now + _CHECK_NS, False
+        """Check if the folder can be used and has enough free space.
+
+        Also removes the oldest captures. Raises OSError if the folder cannot be used.
+        """
+        self._check_ns = now + _CHECK_NS
+        self._is_usable = False
         self._make_folder()
         remove_oldest(self._folder, self._config.keep_mb * _MB)
-        found, minimum = os.statvfs(self._folder), self._config.min_free_mb
-        self._is_usable = found.f_bavail * found.f_frsize >= minimum * _MB
+        status = os.statvfs(self._folder)
+        free_bytes = status.f_bavail * status.f_frsize
+        minimum = self._config.min_free_mb
+        self._is_usable = free_bytes >= minimum * _MB
         if not self._is_usable:
             self._end_part()
             text = f"{self._folder}: less than {minimum} MB are free: nothing is recorded"
@@ -197,10 +235,14 @@ class Recorder:
         if not os.access(self._folder, os.W_OK | os.X_OK):
             raise PermissionError(1, "may not be written to")
 
-    def _remark(self, items: list[Item], now: int) -> None:
-        """Add what only the recorder knows, at the time of the last entry: times do not decrease."""
+    def _append_remarks(self, items: list[Item], now: int) -> None:
+        """Append entries about losses and the wall clock.
+
+        They have the time of the last entry, because times must not decrease.
+        """
         last = items[-1][0]
-        if (lost := self._overflowed + self._unwritten - self._recorded_losses) > 0:
+        lost = self._overflowed + self._unwritten - self._recorded_losses
+        if lost > 0:
             self._recorded_losses += lost
             items.append((last, Kind.LOST, 0, numbers_data(lost), 0, None))
         if now - self._clock_ns >= _CLOCK_NS:
@@ -211,28 +253,31 @@ class Recorder:
                 items.append((last, Kind.CLOCK, 0, numbers_data(last + offset), 0, None))
 
     def _fail(self, error: Exception, now: int) -> None:
-        file, self._file = self._file, None
+        file = self._file
+        self._file = None
         if file is not None:
             file.abandon()
         self.facts.file = ""
-        self._check_ns, self._is_usable = now + _CHECK_NS, False
+        self._check_ns = now + _CHECK_NS
+        self._is_usable = False
         reason = reason_of(error)
         self._note_problem(f"{self._folder}: cannot be written: {reason}. Trying again.")
 
-    def _note_problem(self, problem: str, over: str = "") -> None:
-        """Nothing is recorded now because of a problem, or it is again."""
+    def _note_problem(self, problem: str, end: str = "") -> None:
+        """Report the problem that prevents recording. An empty problem reports ``end`` instead."""
         self.facts.problem = problem
-        self._worker.faults.note("captures: folder", bool(problem), f"captures: {problem or over}")
+        self._worker.faults.note("captures: folder", bool(problem), f"captures: {problem or end}")
 
     def _new_part(self, since: int) -> "CapturePart":
-        """``since``: time of its first entry."""
+        """Create the next part of the capture. ``since`` is the time of its first entry."""
         now = self._clock()
         self._offset = time.time_ns() - now
         self._clock_ns = now
         wall = since + self._offset
         if not self._stamp:
             self._stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(wall // SECOND))
-        part, self._part = self._part, self._part + 1  # a name is tried once
+        part = self._part
+        self._part += 1  # also after a failure, so that no name is tried twice
         self._recorded_devices = self._devices
         header = dict(self.header) | {
             "run": self._run,
@@ -245,14 +290,15 @@ class Recorder:
         return CapturePart(self._folder / name, json_payload(header), now)
 
     def _end_part(self) -> None:
-        file, self._file = self._file, None
+        file = self._file
+        self._file = None
         if file is not None:
             self.facts.file = ""
             self.facts.bytes += file.close()
 
 
 class CapturePart:
-    """One file of a capture, locked while it is written."""
+    """One file of a capture. It is locked while it is written."""
 
     def __init__(self, path: Path, header: bytes, now: int) -> None:
         self.path = path
@@ -260,17 +306,18 @@ class CapturePart:
         self.size = 0
         self._number = 0
         self._new = 0
+        """Number of bytes written since the last ``sync``."""
         self._header: bytes | None = header
-        self._fd = os.open(
-            self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o640
-        )
+        """The header until it has been written a second time."""
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        self._fd = os.open(self.path, flags, 0o640)
         try:
-            with contextlib.suppress(OSError):  # a file system without locks
+            with contextlib.suppress(OSError):  # some file systems have no locks
                 fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self.write(b"H", header)
-            with contextlib.suppress(OSError):  # a file system that cannot
+            with contextlib.suppress(OSError):  # some file systems cannot sync a folder
                 sync_folder(path.parent)
-        except BaseException:  # nothing is in there yet
+        except BaseException:
             os.close(self._fd)
             with contextlib.suppress(OSError):
                 self.path.unlink()
@@ -284,25 +331,29 @@ class CapturePart:
         self._new += len(data)
         write_all(self._fd, data)
 
-    def take(self, items: list[Item]) -> None:
-        """Append what came."""
+    def append(self, items: list[Item]) -> None:
+        """Append a block with entries."""
         self.write(b"D", data_payload(items))
         if self._header is not None:
-            # once more, elsewhere: without it nothing can be made of the rest
+            # The header is written twice, because without it the file cannot be read.
             self.write(b"H", self._header)
             self._header = None
 
     def sync(self) -> int:
-        """Force to the disk what was written; how many bytes since the last call. OSError where somebody removed a file."""
+        """Force the file to the disk. Returns the number of bytes written since the last call.
+
+        Raises OSError if the file was removed.
+        """
         if os.fstat(self._fd).st_nlink == 0:
             raise OSError(errno.ENOENT, "what was being written was removed")
         if self._new:
             os.fdatasync(self._fd)
-        new, self._new = self._new, 0
+        new = self._new
+        self._new = 0
         return new
 
     def close(self) -> int:
-        """Close in good order; how many bytes since the last ``sync``."""
+        """Write the end and close. Returns the number of bytes since the last ``sync``."""
         try:
             self.write(b"E", b"")
             os.fdatasync(self._fd)
@@ -311,13 +362,16 @@ class CapturePart:
         return self._new
 
     def abandon(self) -> None:
-        """Close without writing any more."""
+        """Close without writing the end."""
         with contextlib.suppress(OSError):
             os.close(self._fd)
 
 
 def remove_oldest(folder: Path, keep_bytes: int) -> None:
-    """Keep the folder below a size, 0: any; what is being written, by any process, stays."""
+    """Remove the oldest captures until the folder has at most ``keep_bytes``.
+
+    0 means no limit. Files that any process is writing are kept.
+    """
     if not keep_bytes:
         return
     found: list[tuple[int, str, int, Path]] = []
@@ -330,7 +384,7 @@ def remove_oldest(folder: Path, keep_bytes: int) -> None:
     for _, _, size, path in sorted(found):
         if total <= keep_bytes:
             return
-        if not is_locked(path):  # it is being written
+        if not is_locked(path):
             with contextlib.suppress(OSError):
                 path.unlink()
                 total -= size

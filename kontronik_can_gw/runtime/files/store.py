@@ -1,11 +1,15 @@
-"""The parameter files of all nodes in one folder: read at start, written by a thread of its own.
+"""Reads the parameter files of all nodes at the start, and writes them in a thread.
 
-What may touch what: everything is called by the loop's thread; only ``_write_all`` and what it calls run in the worker's. Savings and
-results are handed over without waiting, so no disk, be it full, read-only or slow, holds the loop up.
+All methods are called by the loop's thread, except ``_write_all`` and the functions that it calls,
+which run in the worker's thread. Savings and results are handed over without waiting. So a full,
+read-only or slow disk does not delay the loop.
 
-A file is replaced, never changed: temporary file in the same folder, write, fsync, rename, fsync of the folder. After a loss of power at
-any instant the old content is there or the new one; once a saving is reported as on disk, it is the new one. After a failed saving it is
-the old one (the new one, if only the last step failed).
+A file is never changed, but replaced: write a temporary file in the same folder, fsync, rename,
+fsync of the folder. This guarantees:
+
+1. After a loss of power at any instant, the file has either the old or the new content.
+2. After a successful result of a saving, it has the new content.
+3. After a failed saving, it has the old content, or the new one if only the last step failed.
 """
 
 import contextlib
@@ -23,7 +27,10 @@ _Content = TypeVar("_Content")
 
 
 class ParameterStore:
-    """One file ``NAME.params`` for each node in one folder (mode 0700, made when it is first needed), readable by the owner only (0600)."""
+    """Keeps one file ``NAME.params`` for each node in one folder.
+
+    The folder is created when it is first needed, with mode 0700. The files have mode 0600.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -32,9 +39,10 @@ class ParameterStore:
         self._lock_files: list[int] = []
 
     def lock(self, name: str) -> str | None:
-        """Keep other gateways from a node's file until ``close``: RunError where one has it.
+        """Lock a node's file against other gateways until ``close``.
 
-        Where no lock can be made nothing can be saved either: returns the reason.
+        Raises RunError if another gateway uses it. Returns the reason if no lock can be created,
+        in which case no parameters can be saved either.
         """
         path = parameter_file(self._folder, name)
         try:
@@ -42,7 +50,8 @@ class ParameterStore:
             self._lock_files.append(lock_file(path.with_suffix(".lock")))
         except Taken:
             raise RunError(
-                f"{path}: is in use by another gateway. Give this one its own canopen.store, or its ESC another name."
+                f"{path}: is in use by another gateway. "
+                "Give this one its own canopen.store, or its ESC another name."
             ) from None
         except OSError as error:
             return f"{path}: {reason_of(error)}"
@@ -51,12 +60,16 @@ class ParameterStore:
     def load(
         self, name: str, decode: Callable[[bytes], _Content]
     ) -> tuple[_Content | None, str | None]:
-        """Read the parameters of a node. Must be called before the first ``save`` for it.
+        """Return the stored parameters of a node. Call it before the node's first saving.
 
-        Returns the content, and the reason if it cannot be read. Both are None if there is no file.
-        A damaged file, for which ``decode`` raises ValueError, is renamed to
-        ``NAME.params.damaged`` and replaces an older one of that name. A file that cannot be read
-        now stays until parameters are saved. A file that a killed writer left is removed.
+        1. If the file is missing, the result is None twice.
+        2. If it is damaged, because ``decode`` raises ValueError, the result is None and the
+           reason. The file is kept as ``NAME.params.damaged``, which replaces an older file of
+           that name.
+        3. If it cannot be read, the result is None and the reason. The file stays until parameters
+           are saved, because it may be readable again later.
+
+        The unfinished file of a killed gateway is removed.
         """
         path = parameter_file(self._folder, name)
         with contextlib.suppress(OSError):
@@ -74,24 +87,29 @@ class ParameterStore:
             return None, f"{path}: {error}"
 
     def save(self, name: str, data: bytes) -> bool:
-        """Let ``data`` become the file's content; never blocks. True: exactly one result follows; results come in the order of the savings.
+        """Replace the file's content by ``data``. Never blocks.
 
-        False: the system gives no thread, or the store is closed; no result follows.
+        1. Returns True if exactly one result follows. Results have the order of the savings.
+        2. Returns False if the system provides no thread, or the store is closed. Then no result
+           follows.
         """
         return self._worker.start() and self._worker.put((name, data))
 
     def fileno(self) -> int:
-        """Give a descriptor that is readable while results wait; -1 after ``close``."""
+        """Return a descriptor that is readable while there are results. -1 after ``close``."""
         return self._results.fileno()
 
     def results(self) -> list[tuple[str, str | None]]:
-        """Take the results since the last call: the name, and None if the content is on disk, else the reason."""
+        """Return the results since the last call: the node's name, and the reason of a failure.
+
+        The reason is None if the content is on disk.
+        """
         return self._results.take()
 
     def close(self, timeout: float) -> bool:
-        """Take no more, and wait for what is queued, at most ``timeout`` seconds. False: that was not enough.
+        """Accept no more savings, and wait at most ``timeout`` seconds for the queued ones.
 
-        ``results`` may be called once more after it.
+        Returns False if some are not finished. ``results`` may be called once afterwards.
         """
         has_ended = self._worker.stop(timeout)
         self._results.close()
@@ -104,7 +122,7 @@ class ParameterStore:
         for name, data in savings:
             try:
                 problem = self._write(name, data)
-            except Exception as error:  # a mistake of ours: the saving has its result all the same
+            except Exception as error:  # a bug; each saving must have a result nevertheless
                 problem = repr(error)
             self._results.put((name, problem))
 
@@ -124,7 +142,7 @@ class ParameterStore:
 
 
 def parameter_file(folder: Path, name: str) -> Path:
-    """Where the parameters of a node are."""
+    """Return the path of a node's parameter file."""
     return folder / f"{name}.params"
 
 
@@ -133,7 +151,7 @@ def _temporary(path: Path) -> Path:
 
 
 def _make_folder(folder: Path) -> None:
-    """Make the folder with those above it, and put each one's entry on disk."""
+    """Create the folder and its parents, and force the entry of each to the disk."""
     if folder.is_dir():
         return
     _make_folder(folder.parent)

@@ -1,4 +1,4 @@
-"""One ESC's serial port as the loop has it: opened, read, lost, found again; and what is logged of that ESC."""
+"""Opens, reads and reopens the serial port of one ESC, and logs the faults of that ESC."""
 
 import logging
 import time
@@ -26,18 +26,19 @@ from kontronik_can_gw.times import MS, NEVER, SECOND
 
 MAX_RETRY_NS = SECOND
 LOOK_NS = 100 * MS
-"""Interval at which the ports' settings are checked while the loop turns in Python (LOOK in linux.c).
+"""Interval between checks of the ports' settings while the loop runs in Python (LOOK in linux.c).
 
-If another program switches echo on, the driver returns to the ESC what it sends until the next check.
+If another program switches echo on, the driver returns the ESC's bytes to it until the next check.
 """
 DIAGNOSIS_NS = 3 * SECOND
-"""Without telemetry for this long, the reason is looked for."""
+"""After this time without telemetry, the gateway looks for the reason."""
 
 
 class EscPort:
-    """One ESC's port. ``reopened``: how often it came back; ``line_errors``: since the start, by kind.
+    """The serial port of one ESC. It is opened again after each loss.
 
-    While the port is lost it is in ``lost``, so that the others need not be checked.
+    While the port is lost, it is a member of the set ``lost``. So the loop need not check the
+    other ports.
     """
 
     def __init__(
@@ -54,9 +55,11 @@ class EscPort:
         self.port: SerialPort | None = None
         self.identity: Identity | None = None
         self.reopened = -1
+        """Number of times that the port was opened again. -1 before it was opened at all."""
         self.due = 0
-        """While it is lost: when ``reopen`` has something to do."""
+        """Time of the next attempt to open the port. It has no meaning while the port is open."""
         self.line_errors: dict[str, int] = {}
+        """Line errors since the start of the gateway, by kind."""
         self._index = index
         self._lost = lost
         self._gateway = gateway
@@ -76,7 +79,7 @@ class EscPort:
         return self._gateway.escs[self._index].settings.name
 
     def facts(self) -> PortFacts:
-        """For the statistics."""
+        """Return the state of the port for the status document."""
         return PortFacts(
             self.name,
             self.path if self.port is None else self.port.path,
@@ -89,23 +92,27 @@ class EscPort:
         )
 
     def open(self, now: int, wait: bool, others: tuple[Identity | None, ...] = ()) -> None:
-        """Open the port. RunError where that fails, unless ``wait``: then it is tried again.
+        """Open the port.
 
-        ``others``: adapters that are known to belong to other ESCs.
+        Raises RunError if that fails. With ``wait`` it raises nothing, and ``reopen`` tries again.
+        ``others`` are the adapters of the other ESCs.
         """
         try:
             port = SerialPort(self._path_now(others), self._protocol)
         except RunError as error:
             if not wait:
                 raise RunError(f"{self.name}: {error}") from None
-            # which was said when it was lost
-            unplugged = isinstance(error, NoPort) and self.reopened >= 0
-            self._failed(str(error), now, quiet=unplugged)
+            # The loss of an unplugged adapter has already been logged.
+            is_unplugged = isinstance(error, NoPort) and self.reopened >= 0
+            self._failed(str(error), now, quiet=is_unplugged)
             return
         noted = self._noted
-        noted.empty_ns, noted.undrained_ns, noted.is_plain = self._clock(), NEVER, False
-        noted.settings[:], noted.restored = port.settings, False
-        port.discard()  # what came before we listened has no time
+        noted.empty_ns = self._clock()
+        noted.undrained_ns = NEVER
+        noted.is_plain = False
+        noted.settings[:] = port.settings
+        noted.restored = False
+        port.discard()  # the time of arrival of older bytes is unknown
         self.port = port
         self.identity = port.identity()
         self.reopened += 1
@@ -116,20 +123,20 @@ class EscPort:
         self._stuck = StuckCheck(noted)
         self._poller.register(port.fileno(), self.serve, esc=self._index)
         self._gateway.port(self._index, True, now)
-        said = f"{self.name}: {port.path} is open"
+        text = f"{self.name}: {port.path} is open"
         if self._conditions.is_on(self.log.port_condition):
-            self._conditions.end(self.log.port_condition, said, now)
+            self._conditions.end(self.log.port_condition, text, now)
         else:
-            self._conditions.say(logging.INFO, said)
+            self._conditions.say(logging.INFO, text)
         if self._protocol.even_parity and is_mini_uart(port.path):
-            self._conditions.say(
-                logging.WARNING,
-                f"{self.name}: {port.path} is a Raspberry Pi's mini-UART, which cannot do even parity: frames may be lost or never "
-                "come. Use ttyAMA0.",
+            text = (
+                f"{self.name}: {port.path} is a Raspberry Pi's mini-UART, which cannot do even "
+                "parity: frames may be lost or never come. Use ttyAMA0."
             )
+            self._conditions.say(logging.WARNING, text)
 
     def is_at(self, path: str) -> bool:
-        """True if a path leads to this ESC, whatever its name is now."""
+        """Return True if a path leads to this ESC, even under another name."""
         device = device_of(path)
         if device is not None and device == device_of(self.path):
             return True
@@ -138,8 +145,9 @@ class EscPort:
         return self.identity is not None and identity_at(path) == self.identity
 
     def serve(self, now: int, _events: int = 0) -> None:
-        """The port is readable."""
-        noted, port = self._noted, self.port
+        """Read the port, and hand its bytes to the gateway. Call it when the port is readable."""
+        noted = self._noted
+        port = self.port
         noted.served = True
         if port is None:
             return
@@ -151,19 +159,23 @@ class EscPort:
             return
         if data:
             if not noted.is_plain:
-                # a port that goes as soon as it has come is tried more and more seldom
+                # Until bytes arrive, the pauses between attempts grow. So a port that is lost
+                # each time as soon as it is open is tried less and less often.
                 noted.is_plain = True
                 self._retry.succeeded()
             since = noted.undrained_ns
             if since == NEVER:
                 since = max(noted.empty_ns, self._poller.before)
-            # nothing came faster than the wire allows
-            passed = since + len(data) * self._protocol.byte_ns
-            noted.undrained_ns = NEVER if port.drained else min(now, passed)
+            if port.drained:
+                noted.undrained_ns = NEVER
+            else:
+                # The bytes cannot have arrived faster than the wire transmits them.
+                transmitted_ns = since + len(data) * self._protocol.byte_ns
+                noted.undrained_ns = min(now, transmitted_ns)
             self._gateway.receive_bytes(self._index, data, now, since)
 
     def reopen(self, now: int, others: tuple[Identity | None, ...] = ()) -> None:
-        """Try again what is due."""
+        """Open a lost port again if the next attempt is due."""
         if self in self._lost and now >= self.due:
             self.open(now, True, others)
 
@@ -175,11 +187,14 @@ class EscPort:
             self.port = None
 
     def is_stuck(self) -> bool:
-        """True if the loop does not serve this port."""
+        """Return True if the loop does not serve this port."""
         return self._stuck.is_stuck(self.port)
 
     def hold_settings(self) -> None:
-        """Restore the port's settings if another program has changed them; ``report`` logs that."""
+        """Restore the port's settings if another program has changed them.
+
+        ``report`` logs the change.
+        """
         if self.port is not None and not self.port.settings_hold():
             self._noted.restored = True
 
@@ -187,17 +202,21 @@ class EscPort:
         """Count line errors; log restored settings, and the reason if no telemetry is received."""
         if self.port is None:
             return
-        if (counts := self.port.line_errors()) is not self._counted:
+        counts = self.port.line_errors()
+        if counts is not self._counted:
             self._count(counts)
         if self._noted.restored:
             self._noted.restored = False
-            text = f"{self.name}: another program changed the settings of {self.port.path}: set to {self._protocol.line} again"
+            text = (
+                f"{self.name}: another program changed the settings of {self.port.path}: "
+                f"set to {self._protocol.line} again"
+            )
             self._conditions.event(f"{self.name}: settings", text, now)
         self.log.diagnose(self.line_errors, now)
 
     def _count(self, counts: Mapping[str, int]) -> None:
         for kind, count in counts.items():
-            # the driver's own begin anew with each plugging in
+            # The driver's counters restart at 0 when the adapter is plugged in again.
             new = max(0, count - self._counted.get(kind, 0))
             self.line_errors[kind] = self.line_errors.get(kind, 0) + new
             if kind != "break":  # a break is a framing error too
@@ -214,33 +233,36 @@ class EscPort:
         )
 
     def _path_now(self, others: tuple[Identity | None, ...]) -> str:
-        """Where the port is: an adapter that was unplugged may come back under another number.
+        """Return the present path of the port.
 
-        RunError where the configured path is another ESC's adapter now: its values would be taken for this one's.
+        An adapter that was unplugged may get another device number when it is plugged in again.
+        Raises RunError if the configured path leads to another ESC's adapter now, because that
+        ESC's values would be taken for values of this one.
         """
         if self.identity is None or self.path.startswith("/dev/serial/") or self.identity in others:
             return self.path  # adapters with the same serial number cannot be distinguished
         found = find_adapter(self.identity)
         if found is not None:
             return self.path if Path(self.path).resolve() == Path(found) else found
-        if any(
-            other is not None and find_adapter(other) == str(Path(self.path).resolve())
-            for other in others
-        ):
-            raise RunError(
-                f"{self.path}: is another ESC's adapter now. Name ports by /dev/serial/by-id or by-path."
-            )
+        real_path = Path(self.path).resolve()
+        for other in others:
+            if other is not None and find_adapter(other) == str(real_path):
+                raise RunError(
+                    f"{self.path}: is another ESC's adapter now. "
+                    "Name ports by /dev/serial/by-id or by-path."
+                )
         return self.path
 
 
 class EscLog:
-    """The conditions of one ESC in the fault log. ``port_condition`` is the name of what is wrong with its port."""
+    """Logs the faults of one ESC, and finds the reason if no telemetry is received."""
 
     def __init__(self, index: int, gateway: Gateway, conditions: FaultLog) -> None:
         self._esc = gateway.escs[index]
         self._conditions = conditions
         name = self._esc.settings.name
         self.port_condition = f"{name}: port"
+        """Name of the condition "the port is not open" in the fault log."""
         self._link_condition = f"{name}: telemetry"
         self._quality_condition = f"{name}: line quality"
         self._diagnosis_condition = f"{name}: diagnosis"
@@ -249,60 +271,62 @@ class EscLog:
         self._lost_counters = (0, 0)
         self._losses = self._esc.losses
         self._since: Counters | None = self._esc.counters.copy()
-        """Counters at a time before that of ``_sampled``; None: not known since telemetry came."""
+        """Counters at least a second older than ``_sampled``. A diagnosis counts from them.
+
+        None while telemetry is received and in the first second after its loss.
+        """
         self._sampled: tuple[int, Counters] | None = None
+        """Time and counters of the newest sample. None while telemetry is received."""
 
     @property
     def complaint(self) -> str:
-        """Why there is no telemetry, as far as it is known; empty while there is."""
+        """The known reason why there is no telemetry. Empty if there is telemetry."""
         for name in (self.port_condition, self._link_condition, self._diagnosis_condition):
-            if reason := self._conditions.reason(name):
+            reason = self._conditions.reason(name)
+            if reason:
                 return reason
         return ""
 
     def await_telemetry(self, now: int) -> None:
-        """Telemetry may come from now on: a diagnosis is not due yet."""
+        """Postpone the next diagnosis, because telemetry may still arrive."""
         self._diagnosis_due = now + DIAGNOSIS_NS
 
     def follow_link(self, now: int) -> None:
-        """The link's state, layout or device changed: say so."""
-        esc, conditions, name = self._esc, self._conditions, self._esc.settings.name
+        """Log a change of the link's state, of the layout or of the device."""
+        esc = self._esc
+        conditions = self._conditions
+        name = esc.settings.name
         self.await_telemetry(now)
         is_hidden_loss = esc.losses > self._losses and not conditions.is_on(self._link_condition)
         self._losses = esc.losses
         if esc.link in (LinkState.LOST, LinkState.PORT_ERROR):
             self._lost_counters = (esc.counters.crc_errors, esc.counters.dropped_bytes)
-            quiet = esc.link is LinkState.PORT_ERROR  # which is said by itself
+            is_quiet = esc.link is LinkState.PORT_ERROR  # the fault of the port is logged instead
             text = f"{name}: telemetry lost; its values are marked as not available"
-            conditions.begin(self._link_condition, text, now, quiet=quiet, since=esc.live_ns)
+            conditions.begin(self._link_condition, text, now, quiet=is_quiet, since=esc.live_ns)
             conditions.forget(self._quality_condition)
         if esc.link not in (LinkState.OK, LinkState.DEGRADED):
             return
-        if is_hidden_loss:  # while the process was held up, or within one turn
+        if is_hidden_loss:  # it began and ended while the process was suspended, or in one turn
             text = (
                 f"{name}: telemetry was lost for a moment; its values were marked as not available"
             )
             conditions.event(self._link_condition, text, now)
         self._diagnosed.clear()
         conditions.forget(self._diagnosis_condition)
-        layout = esc.protocol.layout_text(esc.layout) or "unknown layout"
+        source = esc.protocol.layout_text(esc.layout) or "unknown layout"
         device = esc.protocol.device_name(esc.info)
-        said = (
-            f"{name}: telemetry {esc.link.name.lower()} ({layout}{f', {device}' if device else ''})"
-        )
+        if device:
+            source += f", {device}"
+        said = f"{name}: telemetry {esc.link.name.lower()} ({source})"
         if conditions.is_on(self._link_condition):
             crc_errors = esc.counters.crc_errors - self._lost_counters[0]
             dropped = esc.counters.dropped_bytes - self._lost_counters[1]
-            conditions.end(
-                self._link_condition,
-                said,
-                now,
-                f"; {crc_errors} CRC errors, {dropped} bytes dropped meanwhile",
-            )
+            losses = f"; {crc_errors} CRC errors, {dropped} bytes dropped meanwhile"
+            conditions.end(self._link_condition, said, now, losses)
         elif esc.link is LinkState.DEGRADED:
-            conditions.begin(
-                self._quality_condition, f"{said}: many CRC errors or dropped bytes", now
-            )
+            text = f"{said}: many CRC errors or dropped bytes"
+            conditions.begin(self._quality_condition, text, now)
         elif conditions.is_on(self._quality_condition):
             conditions.end(self._quality_condition, said, now)
         else:
@@ -310,31 +334,37 @@ class EscLog:
 
     @property
     def diagnosis(self) -> str | None:
-        """Why no frame comes, in words, from the bytes of the last seconds; None while frames come, and shortly after."""
+        """The reason why no frame is received, found in the bytes of the last seconds.
+
+        None while frames are received, and for a second after the last one.
+        """
         if self._esc.up or self._since is None:
             return None
         return self._esc.counters.diagnosis(self._since)
 
     def diagnose(self, line_errors: Mapping[str, int], now: int) -> None:
-        """Log why nothing comes, each reason once. To be called all the time."""
+        """Log the reason why no frame is received, each reason once. Call it regularly."""
         if self._esc.up:
-            self._since = self._sampled = None
+            self._since = None
+            self._sampled = None
             return
         if self._sampled is None:
-            self._sampled = now, self._esc.counters.copy()
+            self._sampled = (now, self._esc.counters.copy())
         elif now - self._sampled[0] >= SECOND:
-            self._since, self._sampled = self._sampled[1], (now, self._esc.counters.copy())
+            self._since = self._sampled[1]
+            self._sampled = (now, self._esc.counters.copy())
         if not self._diagnosis_due or now < self._diagnosis_due:
             return
         self._diagnosis_due = now + DIAGNOSIS_NS
         diagnosis = self.diagnosis
         if diagnosis and diagnosis not in self._diagnosed:
             self._diagnosed.add(diagnosis)
-            text = f"{self._esc.settings.name}: no telemetry: {diagnosis}{_in_words(line_errors)}"
+            counts = _describe(line_errors)
+            text = f"{self._esc.settings.name}: no telemetry: {diagnosis}{counts}"
             self._conditions.begin(self._diagnosis_condition, text, now)
 
 
-def _in_words(line_errors: Mapping[str, int]) -> str:
+def _describe(line_errors: Mapping[str, int]) -> str:
     counts = [
         f"{count} {kind} errors" for kind, count in line_errors.items() if count and kind != "break"
     ]

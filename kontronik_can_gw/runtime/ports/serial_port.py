@@ -1,7 +1,8 @@
-"""A serial port that is only ever read: set as the ESC's protocol says, exclusive.
+"""Reads a serial port exclusively, with the line settings of the ESC's protocol.
 
-Nothing is written to it, ever: an answer could switch an ESC into a mode in which its parameters can be changed. This class has no
-way to write, and the line's echo is switched off before anything else.
+Nothing is ever written to the port, because an answer could switch an ESC into a mode in which its
+parameters can be changed. Therefore SerialPort has no method that writes, and the echo of the line
+is switched off before anything else.
 """
 
 import contextlib
@@ -26,14 +27,17 @@ READ_SIZE = 4096
 
 _TIOCGICOUNT = 0x545D
 MINI_UART = "brcm,bcm2835-aux-uart"
-"""A Raspberry Pi's second UART, by its name in the device tree: it has no parity, and its driver does not say so."""
+"""Name of a Raspberry Pi's second UART in the device tree.
+
+This UART has no parity, but its driver does not report an error if parity is requested.
+"""
 
 _TERMIOS_SIZE = 64
-"""Enough for the kernel's struct termios on any machine."""
+"""Bytes that suffice for the kernel's struct termios on every machine."""
 _COUNTS = struct.Struct("=20i")
 _WAITING = struct.Struct("=i")
 _LINE_ERRORS = {"framing": 6, "overrun": 7, "parity": 8, "break": 9, "buffer_overrun": 10}
-"""Places in struct serial_icounter_struct (linux/serial.h)."""
+"""Positions of the counters in struct serial_icounter_struct (linux/serial.h)."""
 
 
 _NO_PARITY = "A Raspberry Pi's mini-UART (ttyS0) cannot do even parity: use ttyAMA0."
@@ -44,20 +48,22 @@ class PortLost(Exception):
 
 
 class NoPort(RunError):
-    """There is no such port."""
+    """Raised if the port does not exist."""
 
 
 class SerialPort:
-    """An open port. RunError with one clear line where it cannot be opened."""
+    """An open port. Raises RunError with the remedy if the port cannot be opened."""
 
     def __init__(self, path: str, protocol: EscProtocol) -> None:
         self.path = path
-        is_pty = os.path.realpath(path).startswith("/dev/pts/")
-        # one that does not lock it, as a getty, could write to it; its terminal is not touched
-        if Path("/sys/class/tty", Path(os.path.realpath(path)).name).exists() and (
-            users := _users_now_and_then(path)
-        ):
-            raise _in_use(path, users)
+        self._real_path = os.path.realpath(path)
+        is_pty = self._real_path.startswith("/dev/pts/")
+        # A program that does not lock the port, for example a getty, could write to it. The
+        # settings of a terminal that is in use are not changed.
+        if Path("/sys/class/tty", Path(self._real_path).name).exists():
+            users = _users_now_and_then(path)
+            if users:
+                raise _in_use(path, users)
         quiet = _open_quietly(path)
         try:
             self._serial = _open(path, protocol, is_pty)
@@ -68,15 +74,16 @@ class SerialPort:
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         self.drained = True
-        """Whether the last ``read`` left nothing."""
+        """True if the last ``read`` left no bytes in the kernel."""
         try:
             mode = termios.tcgetattr(self._fd)
-            mode[6][termios.VMIN] = 1  # so that an empty port does not look like one that hung up
+            # With VMIN = 0 an empty port could not be distinguished from one that hung up.
+            mode[6][termios.VMIN] = 1
             with contextlib.suppress(termios.error):
                 termios.tcsetattr(self._fd, termios.TCSANOW, mode)
             self._mode = termios.tcgetattr(self._fd)
             self.settings = self._settings_now()
-        except (OSError, termios.error) as error:  # pulled out at this instant
+        except (OSError, termios.error) as error:  # unplugged since it was opened
             self._serial.close()
             raise _explained(path, error.args[0], str(error)) from None
         self._line_errors = line_errors(self._fd)
@@ -90,10 +97,11 @@ class SerialPort:
         return self._fd
 
     def read(self) -> bytes:
-        """What has come, at most READ_SIZE. PortLost when the port has gone.
+        """Return the received bytes, at most READ_SIZE. Raises PortLost if the port was lost.
 
-        A short read does not mean that nothing more waits: the kernel passes on what it has further back only when it is asked again.
-        It is asked by poll, which costs a third of a read that finds nothing.
+        After a short read there may be more bytes, because the kernel passes on its further
+        buffers only when it is asked again. ``poll`` asks it at a third of the cost of a read
+        that finds nothing.
         """
         try:
             data = os.read(self._fd, READ_SIZE)
@@ -108,44 +116,50 @@ class SerialPort:
         return data
 
     def settings_hold(self) -> bool:
-        """Whether the port still is as it was set; if not it is set again. (Another program, as stty, can change it at any time.)"""
+        """Return True if the settings are unchanged. Otherwise restore them and return False.
+
+        Another program, for example stty, can change them at any time.
+        """
         try:
             if self._settings_now() == self.settings:
                 return True
             termios.tcsetattr(self._fd, termios.TCSANOW, self._mode)
         except (OSError, termios.error):
-            return True  # it has gone, which reading will show
+            return True  # the port was lost, which the next read will report
         return False
 
     def _settings_now(self) -> bytes:
-        """struct termios as the kernel has it, which takes a tenth of the time of termios.tcgetattr's list."""
+        """Return the kernel's struct termios. It takes a tenth of the time of termios.tcgetattr."""
         return fcntl.ioctl(self._fd, termios.TCGETS, bytes(_TERMIOS_SIZE))
 
     def line_errors(self) -> Mapping[str, int]:
-        """What the driver has counted so far, by kind; empty where it counts nothing (pseudo terminals, some adapters).
+        """Return the driver's counts of line errors by kind.
 
-        The same object as long as nothing changes.
+        Empty if the driver counts none, as for pseudo terminals and some adapters. Returns the
+        same object as before if no count has changed.
         """
-        if self._line_errors and (found := line_errors(self._fd)) != self._line_errors:
-            self._line_errors = found
+        if self._line_errors:
+            found = line_errors(self._fd)
+            if found != self._line_errors:
+                self._line_errors = found
         return self._line_errors
 
     @property
     def waits_to_be_read(self) -> bool:
-        """True while ``read`` would find bytes."""
+        """True if ``read`` would find bytes."""
         try:
-            return bool(
-                _WAITING.unpack(fcntl.ioctl(self._fd, termios.FIONREAD, bytes(_WAITING.size)))[0]
-            )
+            answer = fcntl.ioctl(self._fd, termios.FIONREAD, bytes(_WAITING.size))
         except OSError:
             return False
+        (count,) = _WAITING.unpack(answer)
+        return bool(count)
 
     def identity(self) -> Identity | None:
-        """Of the USB adapter that the port belongs to; None for another kind of port."""
+        """Return the identity of the port's USB adapter, or None for another kind of port."""
         return identity_at(self._real_path)
 
     def discard(self) -> None:
-        """Throw away what waits to be read."""
+        """Discard the bytes that have not been read yet."""
         with contextlib.suppress(OSError, termios.error):
             termios.tcflush(self._fd, termios.TCIFLUSH)
 
@@ -155,7 +169,10 @@ class SerialPort:
 
 
 def line_errors(fd: int) -> dict[str, int]:
-    """The line errors of an open port since its driver was loaded, by kind; empty where it counts none."""
+    """Return the line errors of an open port since its driver was loaded, by kind.
+
+    Empty if the driver counts none.
+    """
     try:
         counts = _COUNTS.unpack(fcntl.ioctl(fd, _TIOCGICOUNT, bytes(_COUNTS.size)))
     except OSError:
@@ -164,7 +181,7 @@ def line_errors(fd: int) -> dict[str, int]:
 
 
 def is_mini_uart(path: str, root: Path = Path("/")) -> bool:
-    """True for a Raspberry Pi's mini-UART, which cannot do even parity."""
+    """Return True for a Raspberry Pi's mini-UART, which cannot do even parity."""
     device = root / "sys/class/tty" / Path(os.path.realpath(path)).name / "device"
     with contextlib.suppress(OSError):
         for folder in [device.resolve(), *device.resolve().parents][:4]:
@@ -177,16 +194,17 @@ def is_mini_uart(path: str, root: Path = Path("/")) -> bool:
 def _in_use(path: str, users: str) -> RunError:
     who = f": {users}" if users else " (another gateway? a getty?)"
     name = Path(os.path.realpath(path)).name
-    getty = (
-        f"; if it is a getty: sudo systemctl disable --now serial-getty@{name}"
-        if name.startswith("tty")
-        else ""
-    )
+    getty = ""
+    if name.startswith("tty"):
+        getty = f"; if it is a getty: sudo systemctl disable --now serial-getty@{name}"
     return RunError(f"{path}: is in use by another program{who}. End it{getty}.")
 
 
 def device_of(path: str) -> int | None:
-    """The device number that a path leads to (slcan's ``path@baud`` too); None where it leads to none."""
+    """Return the device number to which a path leads, also for slcan's ``path@baud``.
+
+    None if the path does not lead to a device.
+    """
     try:
         status = Path(path.partition("@")[0]).stat()
     except (OSError, ValueError):
@@ -195,7 +213,10 @@ def device_of(path: str) -> int | None:
 
 
 def _open_quietly(path: str) -> int:
-    """Open and switch echo off in one breath: a terminal that was just made echoes what it receives."""
+    """Open a port and switch its echo off at once. Returns the file descriptor.
+
+    A terminal that was just created echoes the bytes that it receives.
+    """
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
@@ -224,19 +245,13 @@ def _open(
         parity = serial.PARITY_NONE
     try:
         return serial.Serial(path, protocol.baud_rate, parity=parity, timeout=0, exclusive=True)
-    except (
-        OSError,
-        termios.error,
-        ValueError,
-    ) as error:
-        # SerialException is an OSError; termios.error is not
-        number = (
-            error.args[0]
-            if error.args and isinstance(error.args[0], int)
-            else getattr(error, "errno", None)
-        )
+    except (OSError, termios.error, ValueError) as error:
+        # SerialException is an OSError; termios.error is not.
+        number = getattr(error, "errno", None)
+        if error.args and isinstance(error.args[0], int):
+            number = error.args[0]
         if number == errno.EINVAL and parity == serial.PARITY_EVEN:
-            if is_pty:  # a pseudo terminal has no parity and may say so
+            if is_pty:  # a pseudo terminal has no parity and may refuse it
                 return _open(path, protocol, is_pty, refuses_parity=True)
             raise RunError(
                 f"{path}: cannot do {protocol.baud_rate} baud with even parity. {_NO_PARITY}"
@@ -246,29 +261,31 @@ def _open(
 
 def _explained(path: str, number: int | None, text: str) -> RunError:
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        ports = sorted(str(p) for p in Path("/dev/serial/by-id").glob("*"))
-        there = (
-            f"Ports there are: {', '.join(ports)}."
-            if ports
-            else "Is the adapter plugged in? See `ls /dev/serial/by-id`."
-        )
-        return NoPort(f"{path}: no such serial port. {there}")
+        ports = sorted(str(port) for port in Path("/dev/serial/by-id").glob("*"))
+        if ports:
+            hint = f"Ports there are: {', '.join(ports)}."
+        else:
+            hint = "Is the adapter plugged in? See `ls /dev/serial/by-id`."
+        return NoPort(f"{path}: no such serial port. {hint}")
     if number == errno.EACCES:
-        group, shared = "dialout", True
+        group = "dialout"
+        is_shared = True
         with contextlib.suppress(OSError, KeyError):
             status = Path(path).stat()
-            shared = status.st_mode & 0o060 == 0o060
+            is_shared = status.st_mode & 0o060 == 0o060
             group = grp.getgrgid(status.st_gid).gr_name
-        if not shared:  # to join the group would not help
+        if not is_shared:  # joining the group would not help
             return RunError(
                 f"{path}: permission denied, to its group {group} too: sudo chmod g+rw {path}."
             )
         return RunError(
-            f"{path}: permission denied. Join its group: sudo usermod -aG {group} $USER, then log in again."
+            f"{path}: permission denied. "
+            f"Join its group: sudo usermod -aG {group} $USER, then log in again."
         )
     if number == errno.EPERM:
         return RunError(
-            f"{path}: the service is not allowed to use this device: sudo systemctl edit kontronik-can-gw, and there under "
+            f"{path}: the service is not allowed to use this device: "
+            "sudo systemctl edit kontronik-can-gw, and there under "
             f"[Service]: DeviceAllow={path} rw."
         )
     if number in (errno.EAGAIN, errno.EBUSY):
@@ -277,12 +294,18 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
 
 
 _seen_users: set[Path] = set()
+"""Folders in /proc of the programs that had a port open when it was last searched for."""
 _next_search: dict[str, float] = {}
+"""Time of the next search by path, in seconds of the monotonic clock."""
 _SEARCH_PAUSE_S = 10.0
 
 
 def _users_now_and_then(path: str) -> str:
-    """Who has the port open; looked for at first and then no more than every ten seconds, because it takes a while on a slow machine."""
+    """Return the text of ``_users``, or "" in the pause between two searches.
+
+    A search takes a while on a slow machine. Therefore there is at most one in ten seconds, unless
+    the last one found a program.
+    """
     now = time.monotonic()
     if now < _next_search.get(path, 0.0) and not _seen_users:
         return ""
@@ -291,8 +314,13 @@ def _users_now_and_then(path: str) -> str:
 
 
 def _users(path: str) -> str:
-    """Who else has the port open, as far as we may see: without root's rights only who has it as terminal (a getty), and the kernel."""
-    device, found = device_of(path), set()
+    """Return the other programs that have the port open, as a text for a message.
+
+    Without root's rights only two kinds of users can be found: the kernel's console, and programs
+    whose controlling terminal is the port (a getty).
+    """
+    device = device_of(path)
+    found = set()
     name = Path(os.path.realpath(path)).name
     with contextlib.suppress(OSError):
         lines = Path("/proc/consoles").read_text().splitlines()
@@ -301,7 +329,7 @@ def _users(path: str) -> str:
                 f"the kernel's console (take console={name} out of the kernel's command line)"
             )
     seen = [process for process in _seen_users if _has_open(process, device)]
-    # who had it open when we last looked mostly has it still: all programs are not looked through each time
+    # All programs are searched only if the earlier users have closed the port.
     for process in seen or Path("/proc").glob("[0-9]*"):
         if process.name != str(os.getpid()) and _has_open(process, device):
             with contextlib.suppress(OSError):
@@ -313,10 +341,14 @@ def _users(path: str) -> str:
 
 
 def _has_open(process: Path, device: int | None) -> bool:
-    """True if a process has a device open, or as its controlling terminal (proc(5): field 7 of stat)."""
+    """Return True if a process has a device open, or as its controlling terminal.
+
+    The terminal is field 7 of the process's ``stat`` file (proc(5)).
+    """
     with contextlib.suppress(OSError, ValueError, IndexError):
-        terminal = int((process / "stat").read_text(errors="replace").rpartition(")")[2].split()[4])
-        # the kernel packs numbers as minor 7..0, major 19..8, minor 31..20
+        stat = (process / "stat").read_text(errors="replace")
+        fields_from_3 = stat.rpartition(")")[2].split()
+        terminal = int(fields_from_3[4])
         if device is not None and terminal == _packed(device):
             return True
     with contextlib.suppress(OSError):
@@ -328,5 +360,7 @@ def _has_open(process: Path, device: int | None) -> bool:
 
 
 def _packed(device: int) -> int:
-    major, minor = os.major(device), os.minor(device)
+    """Return a device number as the kernel packs it: minor 7..0, major 19..8, minor 31..20."""
+    major = os.major(device)
+    minor = os.minor(device)
     return minor & 0xFF | major << 8 | (minor & ~0xFF) << 12

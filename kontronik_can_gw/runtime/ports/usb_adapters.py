@@ -1,4 +1,4 @@
-"""USB serial adapters that are plugged in, identified by what stays the same when their number changes."""
+"""Finds USB serial adapters by properties that stay the same when their device number changes."""
 
 import contextlib
 import os
@@ -10,34 +10,47 @@ from serial.tools.list_ports_linux import SysFS
 
 
 class Identity(NamedTuple):
-    """What identifies a USB adapter, whatever its number is: vendor, product, serial number, or place where it has none."""
+    """The properties that identify a USB adapter under any device number."""
 
     vendor: int
     product: int
     serial: str
     place: str
+    """The interface of the adapter, or its whole USB location if it has no serial number."""
 
 
 def identity_at(path: str) -> Identity | None:
-    """Of the USB adapter that a path leads to now."""
+    """Return the identity of the USB adapter to which a path leads now, or None."""
     real = os.path.realpath(path.partition("@")[0])
-    return next((found for device, found in adapters() if os.path.realpath(device) == real), None)
+    for device, identity in adapters():
+        if os.path.realpath(device) == real:
+            return identity
+    return None
 
 
 def find_adapter(identity: Identity) -> str | None:
-    """The path of the adapter now, as /dev/ttyUSB1; None while it is not plugged in, or if two are alike."""
+    """Return the present path of an adapter, for example /dev/ttyUSB1.
+
+    None if it is not plugged in, or if two adapters have this identity.
+    """
     found = [device for device, other in adapters() if other == identity]
     return found[0] if len(found) == 1 else None
 
 
 def adapters() -> Iterator[tuple[str, Identity]]:
-    """USB adapters that are plugged in: path and identity. The loop waits for this, so ports of other kinds are not asked."""
+    """Yield path and identity of each USB serial adapter that is plugged in.
+
+    The loop waits for this function, so other kinds of ports are not queried.
+    """
     for kind in ("USB", "ACM"):
         for path in sorted(Path("/dev").glob(f"tty{kind}*")):
-            with contextlib.suppress(OSError, ValueError, TypeError):  # one is being unplugged
+            with contextlib.suppress(OSError, ValueError, TypeError):  # it is being unplugged
                 found = SysFS(str(path))
-                if found.vid is not None and found.pid is not None:
-                    serial_number, place = found.serial_number or "", found.location or ""
-                    # an adapter with several ports has one serial number for all
-                    place = place.partition(":")[2] if serial_number else place
-                    yield str(path), Identity(found.vid, found.pid, serial_number, place)
+                if found.vid is None or found.pid is None:
+                    continue
+                serial_number = found.serial_number or ""
+                place = found.location or ""
+                if serial_number:
+                    # An adapter with several ports has one serial number for all of them.
+                    place = place.partition(":")[2]
+                yield str(path), Identity(found.vid, found.pid, serial_number, place)

@@ -1,4 +1,4 @@
-"""What the loop's parts tell of themselves, for the snapshot."""
+"""Records with the state of the loop's parts, from which the status document is made."""
 
 import os
 import time
@@ -15,33 +15,42 @@ from kontronik_can_gw.status import GatewayStatus
 
 
 class GatewayFacts(NamedTuple):
-    """What a gateway knows at one moment, in copies that nobody changes: any thread may read it."""
+    """The state of a gateway at one moment. Any thread may read it, because it never changes."""
 
     escs: Sequence[EscTelemetry]
     status: GatewayStatus
     nodes: Sequence[tuple[int, Any, int]]
     """As Gateway.node_states."""
     outputs: Mapping[str, Any]
-    """What further outputs say of themselves, by their names."""
+    """The facts of the other outputs, by their names."""
     layout: str | None
     """As Gateway.layout."""
     core: str
-    """Its language, and as Gateway.core_note."""
+    """The language of the core."""
     core_note: str
+    """As Gateway.core_note."""
 
 
 def gateway_facts(gateway: Gateway) -> GatewayFacts:
-    """What it knows now."""
-    escs = [esc.frozen() for esc in gateway.escs]
-    core = gateway.core.language, gateway.core_note
-    outputs = {output.name: found for output in gateway.outputs if (found := output.facts())}
+    """Return the present state of a gateway."""
+    outputs = {}
+    for output in gateway.outputs:
+        facts = output.facts()
+        if facts:
+            outputs[output.name] = facts
     return GatewayFacts(
-        escs, gateway.status.frozen(), gateway.node_states(), outputs, gateway.layout, *core
+        escs=[esc.frozen() for esc in gateway.escs],
+        status=gateway.status.frozen(),
+        nodes=gateway.node_states(),
+        outputs=outputs,
+        layout=gateway.layout,
+        core=gateway.core.language,
+        core_note=gateway.core_note,
     )
 
 
 class PortFacts(NamedTuple):
-    """What the loop knows of one ESC's port. ``lost_since_ns``: monotonic, None while it is open."""
+    """The state of one ESC's port."""
 
     name: str
     path: str
@@ -50,12 +59,13 @@ class PortFacts(NamedTuple):
     reopened: int = 0
     line_errors: Mapping[str, int] = {}
     lost_since_ns: int | None = None
+    """Time of the loss on the monotonic clock. None while the port is open."""
     diagnosis: str | None = None
-    """Why no frame comes."""
+    """The reason why no frame is received."""
 
 
 class CanFacts(NamedTuple):
-    """What the loop knows of the CAN interface; its state and its counters are in GatewayStatus."""
+    """The state of the CAN interface. The controller's state and counters are in GatewayStatus."""
 
     interface: str
     channel: str
@@ -65,35 +75,39 @@ class CanFacts(NamedTuple):
     stalled: bool = False
     restart_ms: int | None = None
     error_counters: tuple[int, int] | None = None
-    """Transmit and receive error counter of the controller, where known."""
+    """Transmit and receive error counter of the controller. None if unknown."""
 
 
 class StoreFacts(NamedTuple):
-    """Parameters that wait for the disk, and why the last saving failed ('' where it did not)."""
+    """The state of the parameter store."""
 
     waiting: int = 0
+    """Number of savings that are not on disk yet."""
     last_error: str = ""
+    """The reason why the last saving failed. Empty if it succeeded."""
 
 
 @dataclass(frozen=True)
 class ProgramFacts:
-    """What stays the same while the process runs. ``started``: wall clock at start, UTC; ``ticks``: start time in /proc."""
+    """Values that stay the same while the process runs."""
 
     configuration: str
     version: str = __version__
     pid: int = 0
     ticks: int = 0
+    """Start time of the process in clock ticks, as in /proc."""
     pid_namespace: str = ""
     started: str = ""
+    """Start time of the process in UTC, by the wall clock."""
 
 
 def utc(wall: float) -> str:
-    """Wall clock seconds as text."""
+    """Return Unix time in seconds as text in UTC."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(wall))
 
 
 def program_facts(configuration: Path | str) -> ProgramFacts:
-    """About this process."""
+    """Return the values of this process."""
     pid = os.getpid()
     return ProgramFacts(
         str(Path(configuration).absolute()),

@@ -1,7 +1,7 @@
-"""What the gateway knows of itself, as one JSON document for people and programs.
+"""Makes the status document: the state of the gateway as JSON, for people and programs.
 
-A snapshot is made of what the loop's thread copied at one moment, of the gateway and of what the loop owns, in any thread. Every value in
-it was fresh at that moment, or is null.
+The document is made from copies of the state that the loop's thread has taken at one moment. So any
+thread can make it. Every value in it was fresh at that moment, or is null.
 """
 
 import json
@@ -40,25 +40,27 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.files.recorder import RecorderFacts
 
 FORMAT = 1
-"""Of the document; another number for a change that readers must know of. New keys may come without one."""
+"""Version of the document. New keys do not change it, but incompatible changes do."""
 PROGRAM = "kontronik-can-gw"
 _encoded = json.JSONEncoder(ensure_ascii=False, check_circular=False, separators=(",", ":")).encode
 STALE_NS = 3 * SECOND
-"""A document older than this says nothing of now."""
+"""An older document is out of date."""
 LOG_LINES = 20
 _OTHERWISE = ("variant", "device_raw", "firmware_main", "firmware_sub")
-"""Values that are shown apart from the others."""
+"""Values that have their own keys, apart from ``values``."""
 
 Document = dict[str, Any]
-"""As readers have it."""
+"""A part of the document."""
 
 
 class Moment(NamedTuple):
-    """What a document is made of, in copies that nobody changes. ``now`` monotonic ns, ``wall`` seconds of the wall clock."""
+    """The data of a document. The copies in it never change."""
 
     gateway: GatewayFacts
     now: int
+    """Monotonic time in ns."""
     wall: float
+    """Unix time in seconds."""
     program: ProgramFacts
     process: ProcessFacts
     ports: Sequence[PortFacts]
@@ -69,10 +71,15 @@ class Moment(NamedTuple):
 
 
 def snapshot(moment: Moment, before: Moment | None = None) -> str:
-    """The document, JSON in one line. ``before``: since when events are counted for its rates; None: it has none."""
-    gateway, program, process = moment.gateway, moment.program, moment.process
-    status, store, now = gateway.status, moment.store, moment.now
-    pairs = zip(moment.ports, gateway.nodes, strict=False)
+    """Return the document as one line of JSON.
+
+    Its rates count from ``before``, the data of an earlier document. Without it there are no rates.
+    """
+    gateway = moment.gateway
+    program = moment.program
+    status = gateway.status
+    store = moment.store
+    now = moment.now
     document = {
         "format": FORMAT,
         "program": PROGRAM,
@@ -86,7 +93,7 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
             "pid_namespace": program.pid_namespace,
             "started": program.started,
             "uptime_s": _seconds(now - status.started_ns),
-            **vars(process),
+            **vars(moment.process),
         },
         "gateway": {
             "state": name_in_words(status.state.name),
@@ -101,7 +108,9 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
             _esc(esc, port, status, now)
             for esc, port in zip(gateway.escs, moment.ports, strict=True)
         ],
-        "nodes": [_node(port.name, *node) for port, node in pairs],
+        "nodes": [
+            _node(port.name, *node) for port, node in zip(moment.ports, gateway.nodes, strict=False)
+        ],
         "outputs": gateway.outputs,
         "store": store and {"waiting": store.waiting, "last_error": store.last_error or None},
         "recording": moment.recorder and vars(moment.recorder),
@@ -136,17 +145,23 @@ def _can(can: CanFacts, status: GatewayStatus) -> Document:
 
 
 def _rates(moment: Moment, before: Moment | None) -> Document | None:
-    """What happens in a second: frames on the bus, PDOs of each node."""
-    seconds = 0.0 if before is None else (moment.now - before.now) / SECOND
-    if before is None or seconds <= 0:
+    """Return the rates per second: frames on the bus, PDOs of each node."""
+    if before is None or moment.now <= before.now:
         return None
-    new, old = moment.gateway.status, before.gateway.status
-    pdos = zip(moment.gateway.nodes, before.gateway.nodes, strict=False)
+    seconds = (moment.now - before.now) / SECOND
+    new = moment.gateway.status
+    old = before.gateway.status
+    sent = new.sent_frames - old.sent_frames
+    received = new.received_frames - old.received_frames
+    pdos_per_s = []
+    for new_node, old_node in zip(moment.gateway.nodes, before.gateway.nodes, strict=False):
+        pdos = new_node[2] - old_node[2]
+        pdos_per_s.append(round(pdos / seconds, 1))
     return {
         "seconds": round(seconds, 3),
-        "sent_frames_per_s": round((new.sent_frames - old.sent_frames) / seconds, 1),
-        "received_frames_per_s": round((new.received_frames - old.received_frames) / seconds, 1),
-        "pdos_per_s": [round((now - then) / seconds, 1) for (_, _, now), (_, _, then) in pdos],
+        "sent_frames_per_s": round(sent / seconds, 1),
+        "received_frames_per_s": round(received / seconds, 1),
+        "pdos_per_s": pdos_per_s,
     }
 
 
@@ -155,17 +170,26 @@ def _seconds(ns: int) -> float:
 
 
 def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) -> Document:
-    """One ESC. What is not fresh at ``now`` is None, whatever the last call of ``advance`` knew."""
-    live, info = esc.live, esc.info
+    """Return one ESC. Values that are not fresh at ``now`` are None.
+
+    They may have expired since the last call of ``advance``.
+    """
+    live = esc.live
+    info = esc.info
     if live is not None and now - esc.live_bound_ns > esc.settings.timeout_ns:
         live = None
-    if info is not None and (
-        esc.info_bound_ns is None or now - esc.info_bound_ns > INFO_TIMEOUT_NS
-    ):
+    if esc.info_bound_ns is None or now - esc.info_bound_ns > INFO_TIMEOUT_NS:
         info = None
-    protocol, rate = esc.protocol, esc.frame_rate
+    protocol = esc.protocol
+    rate = esc.frame_rate
     errors, warnings, statuses = _alarms(protocol, protocol.value("operating_errors", live))
+    counters = esc.counters.as_dict()
+    for name in _FURTHER_COUNTERS:
+        counters[name] = getattr(esc, name)
+    selftest_errors = None
     selftest = protocol.value("selftest_errors", info)
+    if selftest is not None:
+        selftest_errors = bit_texts(selftest, protocol.errors.get("selftest_errors", ()))
     return {
         "name": esc.settings.name,
         "port": _port(port, now),
@@ -181,15 +205,12 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
         "frame_rate_hz": None if rate is None else rate / 10,
         "data_age_ms": esc.age_ms(now),
         "losses": esc.losses,
-        "counters": esc.counters.as_dict()
-        | {name: getattr(esc, name) for name in _FURTHER_COUNTERS},
+        "counters": counters,
         "operating_state": protocol.state_text(live),
         "errors": errors,
         "warnings": warnings,
         "statuses": statuses,
-        "selftest_errors": None
-        if selftest is None
-        else bit_texts(selftest, protocol.errors.get("selftest_errors", ())),
+        "selftest_errors": selftest_errors,
         "values": _values(esc, live, info, status, now),
     }
 
@@ -212,7 +233,7 @@ def _values(
     for names, reading in ((_LIVE, live), (_INFO, info)):
         if reading is not None:
             whole, parts, derived = _rows(esc.protocol, names)
-            for name, word in whole:  # as ``physical`` has them
+            for name, word in whole:  # the same results as of ``physical``, but faster
                 found[name] = reading[word]
             for name, word, per_unit in parts:
                 found[name] = reading[word] / per_unit
@@ -227,25 +248,38 @@ def _values(
 def _rows(
     protocol: EscProtocol, names: tuple[str, ...]
 ) -> tuple[list[tuple[str, int]], list[tuple[str, int, int]], list[Value]]:
-    """Values that are a word of the reading, by name; those that are parts of a unit, and how many make one; the others."""
-    values = [values_of(protocol)[name] for name in names]
-    plain = [value for value in values if _is_plain(value)]
-    return (
-        [(value.name, value.words[0]) for value in plain if value.per_unit == 1],
-        [(value.name, value.words[0], value.per_unit) for value in plain if value.per_unit != 1],
-        [value for value in values if value not in plain],
-    )
+    """Return three lists of values:
+
+    1. values that are a word of the reading: name and position of the word,
+    2. values whose word must be divided: name, position and divisor,
+    3. all other values.
+    """
+    whole = []
+    parts = []
+    derived = []
+    for name in names:
+        value = values_of(protocol)[name]
+        if not _is_plain(value):
+            derived.append(value)
+        elif value.per_unit == 1:
+            whole.append((name, value.words[0]))
+        else:
+            parts.append((name, value.words[0], value.per_unit))
+    return whole, parts, derived
 
 
 def _is_plain(value: Value) -> bool:
     is_whole = value.kind is Kind.WIRE and value.supplied and not value.not_on
-    is_exact = 10**6 % value.per_unit == 0  # of six decimals
+    is_exact = 10**6 % value.per_unit == 0  # six decimals suffice
     return is_whole and is_exact and value.divisor is Divisor.ONE
 
 
 @lru_cache(maxsize=256)
 def _alarms(protocol: EscProtocol, word: int | None) -> Sequence[list[str] | None]:
-    """The bits of the error word that are errors, warnings, statuses; one without a name is an error. None without a word."""
+    """Return the texts of the errors, warnings and statuses in the error word.
+
+    A bit without a name is an error. All three are None without a word.
+    """
     if word is None:
         return None, None, None
     bits = protocol.errors.get("operating_errors", ())
@@ -257,29 +291,31 @@ def _alarms(protocol: EscProtocol, word: int | None) -> Sequence[list[str] | Non
 
 
 def _numbers(*groups: Group) -> tuple[Value, ...]:
-    """The values of these groups that are numbers of the ESC: no flags, no names, no counters of the link."""
-    return tuple(
-        value
-        for value in VALUES.values()
-        if value.bit is None
-        and not value.names
-        and value.name not in _OTHERWISE
-        and value.group in groups
-        and (value.group is not Group.LINK or value.pace is Group.LIVE)
-    )
+    """Return the values of these groups that are numbers of the ESC.
+
+    Flags, enumerations and counters of the link are left out.
+    """
+    found = []
+    for value in VALUES.values():
+        is_number = value.bit is None and not value.names
+        is_of_esc = value.group is not Group.LINK or value.pace is Group.LIVE
+        if is_number and is_of_esc and value.group in groups and value.name not in _OTHERWISE:
+            found.append(value)
+    return tuple(found)
 
 
-_LIVE, _INFO, _LINK = (
-    tuple(value.name for value in _numbers(group)) for group in (Group.LIVE, Group.INFO, Group.LINK)
-)
+_LIVE = tuple(value.name for value in _numbers(Group.LIVE))
+_INFO = tuple(value.name for value in _numbers(Group.INFO))
+_LINK = tuple(value.name for value in _numbers(Group.LINK))
 _NAMES = _LIVE + _INFO + _LINK
 _UNITS = json.dumps(
     {value.name: value.unit for value in _numbers(Group.LIVE, Group.INFO, Group.LINK)}
 )
-"""As text, in ASCII: a document without any other character is bytes without further ado."""
+"""The units as text in ASCII. A document in ASCII is converted to bytes most quickly."""
 _FURTHER_COUNTERS = ("suspect_frames", "late_frames", "line_errors")
+_NO_COUNTERS = ("esc_count", "escs_ok", "started_ns")
 _STATUS_COUNTERS = tuple(
-    f.name
-    for f in fields(GatewayStatus)
-    if f.type in (int, "int") and f.name not in ("esc_count", "escs_ok", "started_ns")
+    field.name
+    for field in fields(GatewayStatus)
+    if field.type in (int, "int") and field.name not in _NO_COUNTERS
 )

@@ -1,7 +1,8 @@
-"""The gateway's document of itself (snapshot.py), once a second, to a file that is replaced.
+"""Writes the status document (snapshot.py) to a file once a second.
 
-What may touch what: everything is called by the loop's thread; only ``_work``, ``_fail``, ``_write`` and ``_end`` run in the worker's. What
-the newest document is made of goes from one to the other by a single assignment, so that neither a disk nor the making holds the loop up.
+All methods are called by the loop's thread, except ``_work``, ``_fail``, ``_write`` and ``_end``,
+which run in the worker's thread. The data for the newest document is handed over by a single
+assignment. So neither the disk nor the making of the document delays the loop.
 """
 
 import contextlib
@@ -28,9 +29,10 @@ _CLOSE_S = 0.2
 def open_statistics(configured: Path | None, configuration: Path) -> "Statistics | None":
     """Start to publish the status of the gateway with this configuration.
 
-    ``configured`` is the file of ``statistics.file``, or None. The status goes to that file, and can also be found
-    in the runtime folder, in which ``kontronik-can-gw status`` looks for gateways. Without ``statistics.file`` a
-    failure is logged and None is returned. RunError if another gateway writes the configured file.
+    ``configured`` is the file of ``statistics.file``, or None. The status is written to that file.
+    It can also be found in the runtime folder, in which ``kontronik-can-gw status`` searches for
+    gateways. Without ``statistics.file``, a failure is logged and None is returned. Raises RunError
+    if another gateway writes the configured file.
     """
     published: Path | None = None
     problem = ""
@@ -48,9 +50,9 @@ def open_statistics(configured: Path | None, configuration: Path) -> "Statistics
 
 
 def _published_file(configuration: Path) -> Path:
-    """Return the file in the runtime folder for this gateway. OSError if there can be no such folder."""
+    """Return this gateway's file in the runtime folder. OSError if the folder cannot be created."""
     given = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
-    if given:  # by systemd, for the service alone
+    if given:  # systemd sets it for the service
         return Path(given) / STATUS_FILE
     folder = make_runtime_folder("status")
     _remove_left_over(folder)
@@ -60,8 +62,8 @@ def _published_file(configuration: Path) -> Path:
 def _remove_left_over(folder: Path) -> None:
     """Remove the status files of gateways that were killed.
 
-    A running gateway holds a lock on its file. It also has just written the file, which counts if the gateway runs
-    in another network namespace, because locks hold only within one.
+    A running gateway holds a lock on its file. A lock is not visible in other network namespaces,
+    so a file that was written recently is kept, too.
     """
     for path in folder.glob("*.json"):
         locks = Locks(report=lambda _: None)
@@ -72,7 +74,7 @@ def _remove_left_over(folder: Path) -> None:
 
 
 def _is_recent(path: Path) -> bool:
-    """Return True if the file, or the file that a link leads to, was written a moment ago."""
+    """Return True if the file, or the file that a link leads to, was written recently."""
     try:
         return abs(time.time_ns() - path.stat().st_mtime_ns) <= STALE_NS
     except OSError:
@@ -86,20 +88,23 @@ def _lock_name(file: Path) -> str:
 class Statistics:
     """The thread that writes the file.
 
-    ``due`` is the time of the next document. ``link`` is a symbolic link to the file, made along with it. RunError if
+    ``link`` is a symbolic link to the file that is created together with it. Raises RunError if
     another gateway writes the file.
     """
 
     def __init__(self, file: Path, link: Path | None = None) -> None:
         self.due = 0
+        """Time of the next document."""
         self._link = link
-        self._path, self._what = file, f"statistics file {file}"
+        self._path = file
+        self._target = f"statistics file {file}"
         self._temporary = file.with_name(f".{file.name}.tmp")
         self._newest: Moment | None = None
+        """Data for the next document."""
         self._written: Moment | None = None
-        """What the last document was made of; of the worker's thread."""
+        """Data of the last document. Only the worker's thread uses it."""
         self._is_ours = False
-        """The file is what was written here."""
+        """True if this gateway has written the file."""
         self._locks = Locks()
         if self._locks.hold([_lock_name(file)]):
             raise RunError(
@@ -113,23 +118,24 @@ class Statistics:
             raise RunError("statistics: cannot be begun: no thread can be started")
 
     def publish(self, moment: Moment) -> None:
-        """Let this be what the newest document is made of; never blocks."""
+        """Let the thread write a document from this data. Never blocks."""
         self.due = moment.now + PERIOD_NS
         self._newest = moment
-        self._worker.put(None)  # without room it is awake already
+        self._worker.put(None)  # if the queue is full, the thread is already awake
 
     def reports(self, now: int) -> list[Report]:
-        """Take what went wrong, or is right again, since the last call."""
-        return self._worker.reports(self._what, STALE_NS, now)
+        """Return the begins and ends of faults since the last call."""
+        return self._worker.reports(self._target, STALE_NS, now)
 
     def close(self) -> None:
-        """Remove the file and end the thread; a disk that does not answer is waited for 0.2 s and no longer."""
+        """Remove the file and end the thread. Waits at most 0.2 s for the disk."""
         self._worker.stop(_CLOSE_S)
         self._locks.close()
 
     def _work(self, _items: list[None]) -> None:
         """Write the newest document."""
-        moment, before = self._newest, self._written
+        moment = self._newest
+        before = self._written
         if moment is None or moment is before or self._worker.is_ending:
             return
         self._written = moment
@@ -137,35 +143,44 @@ class Statistics:
         self._faults.note("statistics", False, "the statistics work again")
 
     def _write(self, data: bytes) -> None:
-        """Replace the file: a reader sees the old content or the new one, whole. After a loss of power nobody wants it."""
-        path, temporary, name = self._path, self._temporary, "statistics: file"
+        """Replace the file, so that a reader always finds the whole old or new content.
+
+        The content is not forced to the disk, because it is useless after a loss of power.
+        """
+        path = self._path
+        temporary = self._temporary
+        condition = "statistics: file"
         try:
-            if not os.path.isfile(path) and path.exists():  # noqa: PTH113  each second: as cheaply as it can be
-                raise OSError(errno.EINVAL, "what is there is no plain file")  # as /dev/null
+            # os.path and os.replace are cheaper than pathlib, and this runs every second.
+            if not os.path.isfile(path) and path.exists():  # noqa: PTH113
+                raise OSError(errno.EINVAL, "what is there is no plain file")  # e.g. /dev/null
             write_new(temporary, data, 0o644)
             os.replace(temporary, path)  # noqa: PTH105
         except OSError as error:
             with contextlib.suppress(OSError):
                 temporary.unlink()
-            text = f"{self._what}: cannot be written: {reason_of(error)}. Trying again."
-            self._faults.note(name, True, text)
+            text = f"{self._target}: cannot be written: {reason_of(error)}. Trying again."
+            self._faults.note(condition, True, text)
         else:
             if self._link is not None and not (self._is_ours and self._link.is_symlink()):
                 self._make_link(self._link)
             self._is_ours = True
-            self._faults.note(name, False, f"{self._what}: is written again")
+            self._faults.note(condition, False, f"{self._target}: is written again")
 
     def _make_link(self, link: Path) -> None:
-        """Link to the file, in place of an earlier gateway's link. Only `status` uses it, so failure is no fault."""
+        """Create the link to the file, or replace an earlier gateway's link.
+
+        A failure is not reported, because only the command `status` uses the link.
+        """
         if os.path.realpath(link) == os.path.realpath(self._path):
-            return  # also if statistics.file names the published file itself
+            return  # also if statistics.file is the published file itself
         temporary = link.with_name(f".{link.name}.{os.getpid()}")
         with contextlib.suppress(OSError):
             temporary.symlink_to(self._path.absolute())
             temporary.replace(link)
 
     def _fail(self, error: Exception) -> None:
-        """A mistake of ours in here must not go unsaid."""
+        """Report a bug in the making of the document."""
         self._faults.note("statistics", True, f"the statistics fail: {error!r}. Trying again.")
 
     def _end(self) -> None:

@@ -1,7 +1,8 @@
-"""The log: a line when a condition begins and one when it ends, no flood of one that comes and goes; written by a thread of its own.
+"""Logs the begin and the end of each fault, without a flood of lines if a fault flaps.
 
-A slow disk or a journal that stands still must not hold a frame up. What may touch what: any thread may log; only the writer's thread
-writes (``BackgroundHandler._write``). What finds no room in the queue is counted, and the count is written when there is room again.
+BackgroundHandler writes the log in a thread, because a slow disk or a blocked journal must not
+delay a frame. Any thread may log, but only this thread writes. Lines that do not fit into the
+queue are counted, and their number is written as soon as there is room again.
 """
 
 import contextlib
@@ -17,29 +18,37 @@ from kontronik_can_gw.times import SECOND
 log = logging.getLogger("kontronik_can_gw")
 
 FLAPPING = 6
-"""Beginnings within a minute from which nothing is said of a condition until it has not begun for a minute."""
+"""A condition flaps if it begins this often within a minute.
+
+It is then not logged until it has not begun for a minute.
+"""
 MINUTE = 60 * SECOND
 REMEMBERED = 20
+"""Number of log lines in the status document."""
 CAPACITY = 1000
-"""Lines that may wait to be written."""
+"""Maximum number of lines that wait to be written."""
 
 
 class _Condition:
     def __init__(self) -> None:
         self.begun: int | None = None
+        """Time at which the condition began. None while it does not exist."""
         self.reason = ""
         self.begins: deque[int] = deque(maxlen=FLAPPING)
+        """Times of the last begins."""
         self.count = 0
-        """Beginnings of which nothing was said."""
+        """Number of begins that were not logged."""
         self.flaps = False
 
 
 class FaultLog:
-    """The conditions of a gateway by name. ``recent``: the last lines, for the statistics."""
+    """Logs the conditions of a gateway, which are identified by their names."""
 
     def __init__(self) -> None:
         self.recent: deque[str] = deque(maxlen=REMEMBERED)
+        """The last lines, for the status document."""
         self._held: list[tuple[int, str]] | None = None
+        """Lines that are held back. None if lines are logged at once."""
         self._known: dict[str, _Condition] = {}
 
     def begin(
@@ -51,9 +60,10 @@ class FaultLog:
         level: int = logging.WARNING,
         since: int | None = None,
     ) -> None:
-        """Something is wrong from now on. Said once, and once more when ``text`` becomes another one; ``quiet``: only its end is.
+        """Begin a condition and log it. A call with the same text does nothing.
 
-        ``since``: when it really began, where that is noticed later.
+        If the condition exists and ``text`` differs, the new text is logged. A ``quiet`` begin is
+        not logged, but its end is. ``since`` is the begin of a fault that was noticed later.
         """
         condition = self._known.setdefault(name, _Condition())
         if condition.begun is not None and condition.reason == text:
@@ -69,50 +79,59 @@ class FaultLog:
             return
         if len(condition.begins) == FLAPPING and now - condition.begins[0] < MINUTE:
             condition.flaps = True
-            text = f"{text.removesuffix('.')}. This comes and goes: the next line is when it has not begun for a minute."
+            text = (
+                f"{text.removesuffix('.')}. "
+                "This comes and goes: the next line is when it has not begun for a minute."
+            )
         self.say(level, text)
 
     def event(self, name: str, text: str, now: int, level: int = logging.WARNING) -> None:
-        """Something happened and is over already."""
+        """Log a condition that has already ended."""
         self.begin(name, text, now, level=level)
         self.forget(name)
 
     def end(self, name: str, text: str, now: int, counts: str = "") -> None:
-        """It is over: ``text`` says what holds now; how long it lasted is added, and ``counts``. Nothing where it had not begun."""
+        """End a condition and log its duration. Does nothing if the condition does not exist.
+
+        ``text`` describes the present state. ``counts`` is appended after the duration.
+        """
         condition = self._known.get(name)
         if condition is None or condition.begun is None:
             return
-        lasted, condition.begun = now - condition.begun, None
+        lasted_ns = now - condition.begun
+        condition.begun = None
         if not condition.flaps:
-            self.say(logging.INFO, f"{text}, after {duration(lasted)}{counts}")
+            self.say(logging.INFO, f"{text}, after {duration(lasted_ns)}{counts}")
 
     def forget(self, name: str) -> None:
-        """It is over, and something else says so."""
-        if (condition := self._known.get(name)) is not None and condition.begun is not None:
+        """End a condition without a line, because another line implies its end."""
+        condition = self._known.get(name)
+        if condition is not None:
             condition.begun = None
 
     def is_on(self, name: str) -> bool:
-        """True while the condition lasts."""
+        """Return True while the condition exists."""
         condition = self._known.get(name)
         return condition is not None and condition.begun is not None
 
     def reason(self, name: str) -> str:
-        """What was said at its beginning; empty while it is off."""
+        """Return the text of the condition's begin. Empty if the condition does not exist."""
         return self._known[name].reason if self.is_on(name) else ""
 
     def advance(self, now: int) -> None:
-        """Say what no longer comes and goes."""
+        """Log the conditions that have stopped flapping."""
         for name, condition in self._known.items():
             if condition.flaps and now - condition.begins[-1] >= MINUTE:
                 lasts = condition.begun is not None
                 state = f"it lasts: {condition.reason}" if lasts else "it is over"
                 text = f"{name}: no longer comes and goes, {condition.count} more times; {state}"
                 self.say(logging.INFO, text)
-                condition.flaps, condition.count = False, 0
+                condition.flaps = False
+                condition.count = 0
                 condition.begins.clear()
 
     def say(self, level: int, text: str) -> None:
-        """A line, remembered too."""
+        """Log a line, and remember it for the status document."""
         if self._held is not None:
             self._held.append((level, text))
             return
@@ -120,18 +139,19 @@ class FaultLog:
         self.recent.append(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}")
 
     def hold(self) -> None:
-        """Keep lines back until ``release``."""
+        """Hold lines back until ``release``."""
         self._held = []
 
     def release(self) -> None:
-        """Say what was kept back."""
-        held, self._held = self._held, None
-        for level, text in held or ():
+        """Log the lines that were held back."""
+        held = self._held or []
+        self._held = None
+        for level, text in held:
             self.say(level, text)
 
 
 def duration(ns: int) -> str:
-    """A time span as people read it."""
+    """Return a time span as text in seconds, minutes or hours."""
     seconds = ns / SECOND
     if seconds < 100:
         return f"{seconds:.1f} s"
@@ -141,7 +161,10 @@ def duration(ns: int) -> str:
 
 
 class BackgroundHandler(logging.Handler):
-    """Writes to a stream from a thread. ``close`` waits for what is queued, but not for ever."""
+    """Writes log lines to a stream in a thread.
+
+    ``close`` waits for the queued lines, but at most for ``longest_end_s``.
+    """
 
     def __init__(self, stream: TextIO, longest_end_s: float = 0.1) -> None:
         super().__init__()
@@ -149,27 +172,25 @@ class BackgroundHandler(logging.Handler):
         self._longest_end_s = longest_end_s
         self._worker: Worker[str] = Worker("log-writer", self._write, capacity=CAPACITY)
         self._lost = 0
-        """Lines that found no room: counted by those that log, one at a time (logging.Handler)."""
+        """Number of lines that did not fit into the queue. logging.Handler locks each ``emit``."""
         self._reported_lost = 0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Let the line be written; never waits for the stream."""
+        """Queue the line for writing. Never waits for the stream."""
         try:
-            # what it quotes makes no line of its own
-            record.msg, record.args = (
-                printable(record.getMessage()),
-                (),
-            )
+            # Line breaks in quoted texts must not start a new line of the log.
+            record.msg = printable(record.getMessage())
+            record.args = ()
             line = printable(self.format(record), keep="\n\t") + "\n"
-        except Exception:  # a faulty message is no reason to end
+        except Exception:  # a faulty message must not end the gateway
             line = f"{record.msg!r} cannot be formatted\n"
         if self._worker.put(line):
-            self._worker.start()  # without a thread now: with the next line
+            self._worker.start()  # if there is no thread now, the next line tries again
         else:
             self._lost += 1
 
     def close(self) -> None:
-        """Write what is queued, for ``longest_end_s`` at most."""
+        """Write the queued lines, for at most ``longest_end_s``."""
         self._worker.stop(self._longest_end_s)
         super().close()
 
@@ -179,9 +200,10 @@ class BackgroundHandler(logging.Handler):
         text = "".join(lines)
         lost = self._lost
         if lost > self._reported_lost:
-            text += f"{lost - self._reported_lost} log lines were lost: they could not be written in time\n"
+            count = lost - self._reported_lost
+            text += f"{count} log lines were lost: they could not be written in time\n"
             self._reported_lost = lost
+        # A closed stream has no reader to whom the error could be reported.
         with contextlib.suppress(OSError, ValueError):
-            # nobody reads any more: there is no one to report it to
             self._stream.write(text)
             self._stream.flush()

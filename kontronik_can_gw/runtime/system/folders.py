@@ -1,12 +1,12 @@
-"""Folders for files that matter only while a gateway runs: its locks, and the status that it publishes.
+"""Folders for files that are used only while a gateway runs: its locks and its status.
 
-The folder is the first that this user may use:
+The folder is the first one that this user may use:
 
 1. ``/run/kontronik-can-gw``, shared with the service. Root and the service's user use it. The
    environment variable ``KONTRONIK_RUN`` replaces ``/run``, so that tests never meet a service.
 2. ``kontronik-can-gw`` in ``$XDG_RUNTIME_DIR``, or in ``/run/user/UID`` of a login session.
-3. ``/tmp/kontronik-can-gw-UID``, if there is no session (cron, a container, ``su``). It must belong to this
-   user, because every user can create names in ``/tmp``.
+3. ``/tmp/kontronik-can-gw-UID``, if there is no session (cron, a container, ``su``). This user must
+   own it, because every user can create names in ``/tmp``.
 """
 
 import contextlib
@@ -46,8 +46,9 @@ def make_runtime_folder(purpose: str) -> Path:
 
 
 def status_name(configuration: Path) -> str:
-    """Return the file name under which a gateway with this configuration publishes its status."""
-    return f"{zlib.crc32(os.fsencode(os.path.realpath(configuration))):08X}.json"
+    """Return the name of the status file of a gateway with this configuration."""
+    path = os.fsencode(os.path.realpath(configuration))
+    return f"{zlib.crc32(path):08X}.json"
 
 
 def status_folders() -> list[Path]:
@@ -62,7 +63,7 @@ def status_folders() -> list[Path]:
 
 
 def _own_folders() -> list[Path]:
-    """Return the candidates for this user's own folder, best first; they may not exist."""
+    """Return the candidates for this user's folder, best first. They may not exist."""
     uid = os.geteuid()
     given = os.environ.get("XDG_RUNTIME_DIR")
     sessions = [Path(given)] if given else []
@@ -71,7 +72,7 @@ def _own_folders() -> list[Path]:
 
 
 def _is_own(folder: Path) -> bool:
-    """Return True for an existing folder of this user in which nobody else may write."""
+    """Return True for an existing folder of this user in which no other user may write."""
     try:
         status = folder.lstat()
     except OSError:

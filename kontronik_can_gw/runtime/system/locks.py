@@ -1,8 +1,9 @@
-"""What only one gateway on this machine may have: a node-ID, the DBC's messages, a file that is written.
+"""Locks that prevent two gateways on one machine from using the same node-ID, messages or file.
 
-A lock is a file with flock(2) on it, in a folder where only gateways write: it ends with the process whatever ends it, and nobody who may
-not write there can have one. Its name holds the network namespace, for interfaces of the same name in two of them are two interfaces.
-Where no lock can be made the gateway goes on without, and says so once.
+A lock is a file that is locked with flock(2), in a folder where only gateways may write. It ends
+with the process, even if the process is killed. Its name contains the network namespace, because
+two namespaces may have different interfaces of the same name. If no lock can be created, the
+gateway logs this once and runs without it.
 """
 
 import contextlib
@@ -25,30 +26,32 @@ from kontronik_can_gw.status import UNCONFIGURED
 log = logging.getLogger("kontronik_can_gw")
 
 PREFIX = ""
-"""Before the names of all locks, for tests that run side by side."""
+"""Prefix of the names of all locks, for tests that run at the same time."""
 _MAX_NAME = 200
-"""Bytes of a file's name, of which more than 255 cannot be."""
+"""Maximum length of a lock's name in bytes. The system's limit for a file name is 255 bytes."""
 
 
 class Taken(Exception):
-    """Another process has the lock."""
+    """Raised if another process holds the lock."""
 
 
 def file_name(name: str) -> str:
-    """The file that stands for a lock in this network namespace."""
+    """Return the name of the file for a lock in this network namespace."""
     namespace = 0
     with contextlib.suppress(OSError):
         namespace = Path("/proc/self/ns/net").stat().st_ino
     text = (PREFIX + name).replace("%", "%25").replace("/", "%2F")
-    if len(data := os.fsencode(text)) > _MAX_NAME:
+    data = os.fsencode(text)
+    if len(data) > _MAX_NAME:
         text = f"{zlib.crc32(data):08x}{os.fsdecode(data[-_MAX_NAME:])}"
     return f"{namespace}.{text}"
 
 
 def lock_file(path: Path) -> int:
-    """Lock a file, made where there is none; returns its descriptor. Taken where another process has it, OSError where it cannot be had.
+    """Lock a file and return its descriptor. Creates the file if it is missing.
 
-    Root lets the folder's group, the service's, open those that it makes.
+    Raises Taken if another process holds the lock, and OSError if the file cannot be opened. A
+    file that root creates can also be opened by the folder's group, which is the service's group.
     """
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     try:
@@ -65,12 +68,12 @@ def lock_file(path: Path) -> int:
         raise
     if os.fstat(fd).st_nlink:
         return fd
-    os.close(fd)  # its holder removed it just now: the name stands for another file
+    os.close(fd)  # its holder has removed it, so the name may lead to another file now
     return lock_file(path)
 
 
 class Locks:
-    """Locks that are held together. ``report`` is given what goes wrong, each text once."""
+    """A set of locks. ``report`` is called once with each text that describes a failure."""
 
     def __init__(self, report: Callable[[str], None] = log.warning) -> None:
         self._report = report
@@ -78,29 +81,36 @@ class Locks:
         self._held: dict[str, tuple[Path, int]] = {}
 
     def hold(self, names: Iterable[str]) -> list[str]:
-        """Have exactly these from now on. Returns those that another gateway has."""
+        """Replace the held locks. Returns the names that another gateway holds."""
         wanted = dict.fromkeys(names)
         for name in self._held.keys() - wanted.keys():
             path, fd = self._held.pop(name)
-            with contextlib.suppress(OSError):  # while it is locked nobody else can have this name
+            # The file is removed while it is locked, so that it is not another process's file.
+            with contextlib.suppress(OSError):
                 path.unlink()
             os.close(fd)
         return [name for name in wanted if name not in self._held and not self._take(name)]
 
     def close(self) -> None:
-        """Give everything back."""
+        """Release all locks."""
         self.hold(())
 
     def _take(self, name: str) -> bool:
-        """Take one lock. Returns False if another gateway has it, True also if no lock can be made."""
+        """Acquire one lock. Returns False if another gateway holds it.
+
+        Returns True also if the lock cannot be created.
+        """
         folder = runtime_folder("lock")
         try:
             path = make_runtime_folder("lock") / file_name(name)
-            self._held[name] = path, lock_file(path)
+            self._held[name] = (path, lock_file(path))
         except Taken:
             return False
         except OSError as error:
-            text = f"{folder}: {reason_of(error)}. Nothing keeps a second gateway from the same node-IDs and messages."
+            text = (
+                f"{folder}: {reason_of(error)}. "
+                "Nothing keeps a second gateway from the same node-IDs and messages."
+            )
             if text not in self._reported:
                 self._reported.add(text)
                 self._report(text)
@@ -111,28 +121,33 @@ class Locks:
 
 
 def names_of(gateway: Gateway, channel: str) -> list[str]:
-    """The names of the locks on the ids that a gateway has now."""
+    """Return the names of the locks for the ids that a gateway uses now."""
     conflicts = gateway.conflicts
     names = []
     for output in gateway.node_outputs:
         for node in output.node_states():
             if node.node_id != UNCONFIGURED:
                 names.append(f"{output.node_title} {node.node_id}")
-    if (first := conflicts.first_own_id()) is not None:
+    first = conflicts.first_own_id()
+    if first is not None:
         names.append(f"messages from {first:X}h on")
     names += [ids_in_words(block) for block in conflicts.own_blocks()]
     return [f"{channel}: {name}" for name in names]
 
 
 def in_use(name: str) -> RunError:
-    """What is said of a lock that another gateway has."""
+    """Return the error for a lock that another gateway holds."""
     return RunError(
-        f"CAN {name}: another gateway on this machine sends this. End it, or change node-ID or dbc.base_id."
+        f"CAN {name}: another gateway on this machine sends this. "
+        "End it, or change node-ID or dbc.base_id."
     )
 
 
 class IdLocks:
-    """The locks on the ids of a gateway. A virtual interface is in this process only: it needs none."""
+    """The locks for the ids of a gateway.
+
+    A virtual interface needs no locks, because it exists only in this process.
+    """
 
     def __init__(self, config: CanConfig, gateway: Gateway, conditions: FaultLog) -> None:
         self._config = config
@@ -142,7 +157,11 @@ class IdLocks:
         self._names: list[str] = []
 
     def lock(self, at_start: bool = False) -> None:
-        """Lock what the gateway has now. RunError ``at_start`` where another gateway has it; later that is logged, and tried again."""
+        """Lock the ids that the gateway uses now.
+
+        If another gateway uses one of them, RunError is raised ``at_start``. Later an error is
+        logged, and the next call tries again.
+        """
         if self._config.interface == "virtual":
             return
         names = names_of(self._gateway, self._config.channel)
@@ -156,5 +175,5 @@ class IdLocks:
             self._conditions.say(logging.ERROR, str(in_use(taken)))
 
     def close(self) -> None:
-        """Release them."""
+        """Release the locks."""
         self._locks.close()

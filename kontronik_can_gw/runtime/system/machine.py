@@ -1,4 +1,4 @@
-"""What is the machine's own: serial numbers for its nodes, the folder for its parameters."""
+"""Derives values from the machine: the nodes' serial numbers, and the folder for parameters."""
 
 import contextlib
 import os
@@ -10,9 +10,9 @@ _NAME = "kontronik-can-gw"
 
 
 def machine_identity(root: Path = Path("/")) -> bytes:
-    """What identifies this board: the system's id and the board's serial number (copied memory cards share the former).
+    """Return bytes that identify this board: the system's id and the board's serial number.
 
-    Empty where the system has neither.
+    Boards with copied memory cards have the same system id. Empty if the system has neither.
     """
     found = b""
     for name in _IDENTITIES:
@@ -24,7 +24,7 @@ def machine_identity(root: Path = Path("/")) -> bytes:
 
 
 def identity_digest(root: Path = Path("/")) -> bytes:
-    """A digest of the identity, which may be shown; empty without one."""
+    """Return a digest of the identity, which is not secret. Empty without an identity."""
     identity = machine_identity(root)
     if not identity:
         return b""
@@ -32,9 +32,9 @@ def identity_digest(root: Path = Path("/")) -> bytes:
 
 
 def serial_number(number: int, name: str, identity: bytes) -> int:
-    """1018h:4 of the ESC with this number (1 ...) and name: always the same on this board, different on others.
+    """Return the serial number (1018h:04) of the ESC with this number, from 1, and name.
 
-    0 without an identity.
+    It is always the same on one board, and differs between boards. 0 without an identity.
     """
     if not identity:
         return 0
@@ -43,8 +43,12 @@ def serial_number(number: int, name: str, identity: bytes) -> int:
 
 
 def _sha256(data: bytes) -> bytes:
-    """The digest, by the interpreter's own code where it has that: hashlib loads OpenSSL, 4 MB and 4 ms."""
-    for name in ("_sha2", "_sha256", "hashlib"):  # from Python 3.12 on, before, always
+    """Return the digest, computed by the interpreter's own module if there is one.
+
+    hashlib would load OpenSSL, which takes 4 MB and 4 ms.
+    """
+    # Python 3.12 and later have _sha2, earlier versions _sha256, and all versions have hashlib.
+    for name in ("_sha2", "_sha256", "hashlib"):
         with contextlib.suppress(ImportError):
             digest: bytes = import_module(name).sha256(data).digest()
             return digest
@@ -52,8 +56,12 @@ def _sha256(data: bytes) -> bytes:
 
 
 def state_folder() -> Path:
-    """Where parameters are kept if the configuration does not say: what systemd gives the service, or the user's."""
-    if given := os.environ.get("STATE_DIRECTORY"):
+    """Return the folder for parameters if the configuration names none.
+
+    It is the folder that systemd gives to the service, or a folder of the user.
+    """
+    given = os.environ.get("STATE_DIRECTORY")
+    if given:
         return Path(given.split(":")[0])
     if os.geteuid() == 0:
         return Path("/var/lib") / _NAME

@@ -1,7 +1,8 @@
-"""Real-time priority, so that no other program's load delays a frame: SCHED_FIFO, and memory that is never given away.
+"""Sets real-time priority (SCHED_FIFO) and locks memory, so that other programs delay no frame.
 
-The loop's thread has the priority that was asked for, the threads beside it one less: a thread that held the interpreter's lock and had to
-wait for other programs would hold the loop up with it. The kernel leaves others a share in any case (sched_rt_runtime_us, 5 %).
+The loop's thread gets the configured priority, and the threads beside it get one less. Without
+that, a thread that holds the interpreter's lock could wait for other programs, and the loop would
+wait for it. The kernel always reserves a share of 5 % for other programs (sched_rt_runtime_us).
 """
 
 import contextlib
@@ -11,23 +12,29 @@ import threading
 
 from kontronik_can_gw.errors import RunError
 
-_LOCK_CURRENT, _LOCK_FUTURE, _LOCK_ON_FAULT = 1, 2, 4
-"""Of mlockall(2): what is used, as it comes to be used."""
+# Flags of mlockall(2): lock present and future pages, each when it is first used.
+_LOCK_CURRENT = 1
+_LOCK_FUTURE = 2
+_LOCK_ON_FAULT = 4
 
 
 class _Taken:
-    """What was taken here: what others gave this process (chrt) is left as it is."""
+    """The priority that this module has set. A priority set by chrt is not changed."""
 
     priority: int | None = None
 
 
 def begin(priority: int) -> None:
-    """Take real-time priority for this thread, the loop's, and those beside it. RunError where this process has no right to it."""
+    """Set real-time priority for this thread, which runs the loop, and the threads beside it.
+
+    Raises RunError with the remedy if the process has no permission.
+    """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
         raise RunError(
-            f"run.realtime_priority = {priority}: not permitted. {_how(priority)}, then start again."
+            f"run.realtime_priority = {priority}: not permitted. "
+            f"{_how(priority)}, then start again."
         ) from None
     except OSError as error:
         raise RunError(
@@ -41,11 +48,11 @@ def begin(priority: int) -> None:
 
 
 def follow(thread: threading.Thread) -> None:
-    """Give a thread beside the loop its priority: that of the loop less one; nothing where it has none."""
+    """Give a thread beside the loop the loop's priority minus one, if real-time priority is set."""
     if _Taken.priority is None or thread.native_id is None:
         return
     param = os.sched_param(max(1, _Taken.priority - 1))
-    with contextlib.suppress(OSError):  # it has ended by now
+    with contextlib.suppress(OSError):  # the thread has ended
         os.sched_setscheduler(thread.native_id, os.SCHED_FIFO, param)
 
 
@@ -59,9 +66,9 @@ def _how(priority: int) -> str:
 
 
 def _lock_memory() -> None:
-    """Keep what is used in memory, where that has no limit: with one, an allocation would fail some day."""
+    """Lock the process's memory, unless there is a limit, because an allocation would exceed it."""
     if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY:
         return
-    import ctypes  # a megabyte that others need not pay for
+    import ctypes  # takes a megabyte, so it is imported only if it is needed
 
     ctypes.CDLL(None, use_errno=True).mlockall(_LOCK_CURRENT | _LOCK_FUTURE | _LOCK_ON_FAULT)

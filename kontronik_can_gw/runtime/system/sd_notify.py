@@ -1,6 +1,7 @@
-"""What is reported to systemd and its journal: sd_notify's protocol and the priorities of log lines, without a library.
+"""Reports to systemd by the protocol of sd_notify, and writes priorities for its journal.
 
-Nothing here raises and nothing blocks: a supervisor that does not listen must not disturb the gateway.
+No library is used. No call raises or blocks, because a service manager that does not listen must
+not disturb the gateway.
 """
 
 import logging
@@ -10,15 +11,20 @@ from collections.abc import Mapping
 from typing import TextIO
 
 _MAX_CHARACTERS = 800
-"""Of a status line: systemd reads 4096 bytes of a datagram, and a character has up to 4."""
+"""Maximum length of a status line.
+
+systemd reads 4096 bytes of a datagram, and a character has up to 4 bytes.
+"""
 _PRIORITIES = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6}
-"""Syslog's, by logging's level; anything else is for debugging, 7."""
+"""Priority in syslog by the level of logging. Other levels have priority 7 (debug)."""
 
 
 class Notifier:
-    """The notify socket of the service manager; one thread uses it. Where there is none every call does nothing.
+    """The notify socket of the service manager. Only one thread may use it.
 
-    What the socket does not take now (its queue is full) goes with the next call, but for the sign of life: ``watchdog`` is called often.
+    Without a service manager every call does nothing. If the queue of the socket is full, a
+    message is sent with the next call. A keep-alive is not sent later, because ``watchdog`` is
+    called often.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
@@ -26,95 +32,110 @@ class Notifier:
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = {"@": "\0" + address[1:], "/": address}.get(address[:1], "")
         self.watchdog_ns = _watchdog_ns(environment) if self._address else None
-        """How often ``watchdog`` is to be called at the latest: half of what the manager allows. None: it does not watch this process."""
+        """Longest interval between calls of ``watchdog``: half of the manager's limit.
+
+        None if the manager does not watch this process.
+        """
         self._socket: socket.socket | None = None
         self._pending: dict[str, str] = {}
         self._status = ""
 
     @property
     def present(self) -> bool:
-        """True where a service manager listens."""
+        """True if there is a service manager."""
         return bool(self._address)
 
     def ready(self, status: str = "") -> None:
-        """The gateway has started."""
+        """Report that the gateway has started."""
         self._send({"READY": "1"} | self._news(status))
 
     def status(self, text: str) -> None:
-        """Send a line for people, if it is another one than before."""
-        if news := self._news(text):
+        """Send a status line, if it has changed."""
+        news = self._news(text)
+        if news:
             self._send(news)
 
     def stopping(self, status: str = "") -> None:
-        """About to end."""
+        """Report that the gateway is about to end."""
         self._pending.pop("READY", None)
         self._send({"STOPPING": "1"} | self._news(status))
 
     def watchdog(self) -> None:
-        """Send a sign of life; nothing where nobody watches."""
+        """Send a keep-alive, if the manager watches this process."""
         if self.watchdog_ns is not None:
             self._send({"WATCHDOG": "1"})
             self._pending.pop("WATCHDOG", None)
 
     def close(self) -> None:
-        """Give the socket back; a later call opens it again."""
+        """Close the socket. A later call opens it again."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def _news(self, text: str) -> dict[str, str]:
-        """The line, if it is new. It can hold nothing that would be read as a message of its own."""
-        line = " ".join("".join(c if c.isprintable() else " " for c in text).split())[
-            :_MAX_CHARACTERS
-        ]
+        """Return the variable for the status line, or nothing if the line has not changed.
+
+        The line contains no line break, because the manager would read another variable after it.
+        """
+        printable = "".join(each if each.isprintable() else " " for each in text)
+        line = " ".join(printable.split())[:_MAX_CHARACTERS]
         if not line or line == self._status:
             return {}
         self._status = line
         return {"STATUS": line}
 
-    def _send(self, what: dict[str, str]) -> None:
+    def _send(self, variables: dict[str, str]) -> None:
         if not self._address:
             return
-        self._pending |= what
+        self._pending |= variables
         message = "".join(f"{name}={value}\n" for name, value in self._pending.items())
         try:
             if self._socket is None:
-                self._socket = socket.socket(
-                    socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
-                )
+                kind = socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
+                self._socket = socket.socket(socket.AF_UNIX, kind)
             self._socket.sendto(message.encode(errors="replace"), self._address)
-        except (OSError, ValueError):  # full, or nobody there: it goes with the next call
+        except (OSError, ValueError):  # queue full, or no listener: the next call sends it
             return
         self._pending.clear()
 
 
 def _watchdog_ns(environment: Mapping[str, str]) -> int | None:
-    """Half of the time that the manager waits for this process, None where it does not."""
+    """Return half of the manager's time limit for this process, or None without a limit."""
     try:
-        microseconds = int(environment.get("WATCHDOG_USEC", "0"))
-        meant = int(environment.get("WATCHDOG_PID") or os.getpid()) == os.getpid()
+        limit_us = int(environment.get("WATCHDOG_USEC", "0"))
+        pid = int(environment.get("WATCHDOG_PID") or os.getpid())
     except ValueError:
         return None
-    return microseconds * 500 if meant and microseconds > 0 else None
+    if pid != os.getpid() or limit_us <= 0:
+        return None
+    limit_ns = limit_us * 1000
+    return limit_ns // 2
 
 
 def is_journal(stream: TextIO, environment: Mapping[str, str] | None = None) -> bool:
-    """True where what is written to the stream goes to the journal itself, and not to a file or pipe that took its place."""
-    named = (os.environ if environment is None else environment).get("JOURNAL_STREAM", "")
+    """Return True if the stream leads to the journal, and is not redirected to a file or pipe."""
+    environment = os.environ if environment is None else environment
+    journal = environment.get("JOURNAL_STREAM", "")
     try:
         status = os.fstat(stream.fileno())
-    except (OSError, ValueError):  # closed, or none that has a descriptor
+    except (OSError, ValueError):  # the stream is closed, or has no descriptor
         return False
-    return named == f"{status.st_dev}:{status.st_ino}"
+    return journal == f"{status.st_dev}:{status.st_ino}"
 
 
 def log_formatter(stream: TextIO) -> logging.Formatter | None:
-    """Make the formatter for a stream to the journal: no time, which the journal has itself, and a priority. None for any other."""
+    """Return the formatter for a stream to the journal, or None for any other stream.
+
+    It writes a priority, but no time, because the journal adds the time.
+    """
     return JournalFormatter("%(message)s") if is_journal(stream) else None
 
 
 class JournalFormatter(logging.Formatter):
-    """Each line begins with its priority, ``<3>`` for an error: the journal takes each as an entry of its own."""
+    """Writes the priority before each line, for example ``<3>`` for an error.
+
+    The journal makes an entry of each line.
+    """
 
     def format(self, record: logging.LogRecord) -> str:
         mark = f"<{_PRIORITIES.get(record.levelno, 7)}>"

@@ -1,7 +1,8 @@
-"""Threads beside the loop: what waits for a disk, a driver or a reader waits there.
+"""Runs work that may wait for a disk, a driver or a reader in threads beside the loop.
 
-What may touch what: ``Handover`` and ``Faults`` may be used by any thread. Of a ``Worker`` only ``work``, ``wait`` and ``failed``, as they
-were given to it, run in its thread; everything else belongs to its owner, ``put`` to any thread.
+Any thread may use ``Handover`` and ``Faults``. The functions ``work``, ``wait``, ``failed`` and
+``ended`` that are given to a ``Worker`` run in its thread. Its methods may only be called by its
+owner, except ``put``, which any thread may call.
 """
 
 import contextlib
@@ -23,11 +24,14 @@ log = logging.getLogger("kontronik_can_gw")
 Item = TypeVar("Item")
 
 FAILURE_PAUSE_S = 1.0
-"""After a failure: what fails at once must not take the processor."""
+"""Pause after a failure, so that work that always fails does not use up the processor."""
 
 
 def start_beside_the_loop(thread: threading.Thread) -> bool:
-    """Start a thread that no signal is delivered to: they are to wake the loop. False: the system gives no thread now."""
+    """Start a thread that receives no signals, because signals must wake the loop.
+
+    Returns False if the system provides no thread now.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
     try:
         thread.start()  # it inherits the mask
@@ -40,27 +44,31 @@ def start_beside_the_loop(thread: threading.Thread) -> bool:
 
 
 class Handover(Generic[Item]):
-    """What one thread hands to another: a queue with a limit, and a descriptor that is readable while it holds something.
+    """A queue between two threads, with a limit and a descriptor. No call waits.
 
-    Nothing here waits. A closed one still takes and gives items, but wakes nobody.
+    The descriptor is readable while the queue contains an item. After ``close`` the queue still
+    accepts and returns items, but wakes no thread.
     """
 
     def __init__(self, capacity: int = sys.maxsize) -> None:
         self._capacity = capacity
         self._items: deque[Item] = deque()
-        self._lock = threading.RLock()  # what is collected inside may log
-        """Held for an instant only: nobody writes to the descriptor's number once it is closed, for it may be another's then."""
+        self._lock = threading.RLock()
+        """Prevents a write to the descriptor after ``close``, when its number may have a new owner.
+
+        It is held only briefly. It is reentrant because a garbage collection inside may log.
+        """
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def __len__(self) -> int:
         return len(self._items)
 
     def fileno(self) -> int:
-        """The descriptor; -1 after ``close``."""
+        """Return the descriptor. -1 after ``close``."""
         return self._fd
 
     def put(self, item: Item) -> bool:
-        """Add an item. False: there is no room."""
+        """Append an item. Returns False if the queue is full."""
         with self._lock:
             if len(self._items) >= self._capacity:
                 return False
@@ -69,13 +77,13 @@ class Handover(Generic[Item]):
         return True
 
     def wake(self) -> None:
-        """Let the descriptor be readable until the next ``take``."""
+        """Make the descriptor readable until the next ``take``."""
         with self._lock:
             if self._fd >= 0:
                 os.eventfd_write(self._fd, 1)
 
     def take(self, limit: int = sys.maxsize) -> list[Item]:
-        """The oldest items, at most ``limit``."""
+        """Remove the oldest items, at most ``limit``, and return them."""
         with self._lock:
             if self._fd >= 0:
                 with contextlib.suppress(BlockingIOError):
@@ -87,45 +95,55 @@ class Handover(Generic[Item]):
         return taken
 
     def close(self) -> None:
-        """Close the descriptor; may be called again."""
+        """Close the descriptor. A second call changes nothing."""
         with self._lock:
-            fd, self._fd = self._fd, -1
+            fd = self._fd
+            self._fd = -1
             if fd >= 0:
                 os.close(fd)
 
 
 class Report(NamedTuple):
-    """A fault that begins, or is over. ``name`` is that of the condition in the fault log."""
+    """The begin or the end of a fault."""
 
     name: str
+    """Name of the condition in the fault log."""
     begins: bool
     text: str
 
 
 class Faults:
-    """Faults of a worker on their way to the fault log: one report as each begins, one when it is over."""
+    """Collects reports of a worker's faults for the fault log: one at the begin, one at the end."""
 
     def __init__(self) -> None:
         self._on: set[str] = set()
         self._reports: deque[Report] = deque()
 
     def note(self, name: str, is_on: bool, text: str) -> None:
-        """How it is now; nothing is reported where it was so before. A name belongs to one thread."""
-        if is_on != (name in self._on):
-            (self._on.add if is_on else self._on.discard)(name)
-            self._reports.append(Report(name, is_on, text))
+        """Set whether a fault exists now. Only a change is reported.
+
+        All calls with one name must be made by one thread.
+        """
+        if is_on == (name in self._on):
+            return
+        if is_on:
+            self._on.add(name)
+        else:
+            self._on.discard(name)
+        self._reports.append(Report(name, is_on, text))
 
     def take(self) -> list[Report]:
-        """The reports since the last call."""
+        """Return the reports since the last call."""
         return [self._reports.popleft() for _ in range(len(self._reports))]
 
 
 class Worker(Generic[Item]):
-    """A thread that does what it is handed, oldest first.
+    """A thread that processes items, oldest first.
 
-    ``work`` is called after each ``wait`` with the items that have come, and a last time at the end, then ``ended``. What they raise is
-    given to ``failed`` and does not end the thread. ``wait`` returns when there is something to do; without it the worker waits for items.
-    ``faults``: what the work reports. ``busy_since``: when the work began that goes on, by ``clock``; None: there is none.
+    1. ``wait`` must return when there is work. Without it, the worker waits for items.
+    2. ``work`` is called after each ``wait`` with the waiting items, and a last time at the end.
+    3. ``ended`` is called after the last ``work``.
+    4. ``failed`` is called with an exception of these functions, which does not end the thread.
     """
 
     def __init__(
@@ -140,7 +158,9 @@ class Worker(Generic[Item]):
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.faults = Faults()
+        """The faults that the work reports."""
         self.busy_since: int | None = None
+        """Start of the present call of ``work``, by ``clock``. None between calls."""
         self._clock = clock
         self._name = name
         self._work = work
@@ -152,7 +172,10 @@ class Worker(Generic[Item]):
         self._thread: threading.Thread | None = None
 
     def start(self) -> bool:
-        """Start the thread if it does not run yet. False: the system gives no thread now."""
+        """Start the thread if it does not run yet.
+
+        Returns False if the system provides no thread now.
+        """
         if self._thread is None:
             thread = threading.Thread(target=self._run, name=self._name, daemon=True)
             if not start_beside_the_loop(thread):
@@ -161,33 +184,40 @@ class Worker(Generic[Item]):
         return True
 
     def put(self, item: Item) -> bool:
-        """Hand an item over; never waits. False: too many wait, or the worker is to end."""
+        """Hand an item over. Never waits.
+
+        Returns False if the queue is full or if the worker is ending.
+        """
         return not self._ending.is_set() and self._items.put(item)
 
     @property
     def is_ending(self) -> bool:
-        """True from ``end`` on."""
+        """True after a call of ``end``."""
         return self._ending.is_set()
 
-    def reports(self, what: str, slow_ns: int, now: int) -> list[Report]:
-        """Faults that have begun, or are over, since the last call.
+    def reports(self, target: str, slow_ns: int, now: int) -> list[Report]:
+        """Return the begins and ends of faults since the last call.
 
-        One is that a disk does not answer: the work, on the file or folder ``what``, takes longer than ``slow_ns``.
+        A call of ``work`` that takes longer than ``slow_ns`` is a fault, too: the disk of
+        ``target``, a file or folder, does not answer.
         """
         since = self.busy_since
         is_slow = since is not None and now - since > slow_ns
         if is_slow or since is None:
             text = "does not answer; the gateway is not held up." if is_slow else "answers again"
-            self.faults.note(f"{what}: disk", is_slow, f"{what}: the disk {text}")
+            self.faults.note(f"{target}: disk", is_slow, f"{target}: the disk {text}")
         return self.faults.take()
 
     def end(self) -> None:
-        """Let the thread end when it has done what waits; may be called by the thread itself."""
+        """Let the thread end after the waiting items. The thread may call it, too."""
         self._ending.set()
         self._items.wake()
 
     def stop(self, limit_s: float) -> bool:
-        """End, and wait for it at most so long. False: that was not enough; the thread is left, and ends when it can."""
+        """End the thread, and wait at most ``limit_s`` for its end.
+
+        Returns False if it still runs. It then ends as soon as its work returns.
+        """
         self.end()
         if self._thread is not None:
             self._thread.join(limit_s)
@@ -197,19 +227,22 @@ class Worker(Generic[Item]):
         return True
 
     def pause(self, seconds: float) -> None:
-        """Wait, in the thread: so long, or until the worker is to end."""
+        """Wait in the thread for this time, or until ``end`` is called."""
         self._ending.wait(seconds)
 
     def _run(self) -> None:
         is_last = False
         while not is_last:
             try:
-                if not self._ending.is_set():  # whose wake may be read already, with the last items
+                # The last ``take`` may already have consumed the wake of ``end``.
+                if not self._ending.is_set():
                     self._wait()
-                is_last = self._ending.is_set()  # asked first: what was put before the end is done
-                items, self.busy_since = self._items.take(), self._clock()
+                # This must be read before ``take``, so that no item put before the end is lost.
+                is_last = self._ending.is_set()
+                items = self._items.take()
+                self.busy_since = self._clock()
                 self._work(items)
-            except Exception as error:  # whatever it is: the next item has its turn
+            except Exception as error:
                 self._failed(error)
                 self.pause(FAILURE_PAUSE_S)
             self.busy_since = None

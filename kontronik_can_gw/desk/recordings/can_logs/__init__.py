@@ -1,1 +1,4 @@
-"""Logs of CAN frames as the tools of this field write and read them: candump, Vector ASC and BLF, PEAK TRC, MF4 bus logging."""
+"""Logs of CAN frames in the formats of other tools.
+
+They are candump, Vector ASC and BLF, PEAK TRC, and MF4 bus logging.
+"""

@@ -39,12 +39,16 @@ _CLOSE_S = 600
 
 
 class AscReader(TextReader):
-    """Vector ASC, base hex or dec, times absolute or relative, CAN and CAN FD."""
+    """The reader of Vector ASC: base hex or dec, times absolute or relative, CAN and CAN FD."""
 
-    _base, _relative, _now = 16, False, 0
+    _base = 16
+    _relative = False
+    _now = 0
+    """Time of the last line, if times are relative."""
 
     def _read_head(self, lines: list[bytes]) -> None:
-        written = began = None
+        written = None
+        began = None
         for line in lines:
             head = line.decode("utf-8", "replace").lower().split()
             if head[:1] == ["base"]:
@@ -54,8 +58,10 @@ class AscReader(TextReader):
                 written = asc_time(head[2:])
             elif head[:2] == ["begin", "triggerblock"]:
                 began = asc_time(head[3:])
-            elif (found := _frame(line)) is not None:
-                break
+            else:
+                found = _frame(line)
+                if found is not None:
+                    break
         else:
             found = None
         began = began or written
@@ -63,7 +69,8 @@ class AscReader(TextReader):
             return
         if found is not None and not self._relative:
             began = _time_zero(began, written or began, float(found["time"]))
-        if (start_ns := _unix_ns(began)) >= OLDEST_WALL_S * SECOND_NS:
+        start_ns = _unix_ns(began)
+        if start_ns >= OLDEST_WALL_S * SECOND_NS:
             self.wall_start_ns = start_ns
 
     def _frame(self, line: bytes) -> LogFrame | None:
@@ -73,13 +80,13 @@ class AscReader(TextReader):
             return None
         time_ns = nanoseconds(words[0])
         if self._relative:
-            time_ns = self._now = self._now + time_ns
+            self._now += time_ns
+            time_ns = self._now
         is_fd = words[1:2] == [b"canfd"]
         if b"errorframe" in words[2:5]:
             channel = words[2] if is_fd else words[1]
-            return checked(
-                LogFrame(time_ns, error_frame(), b"tx" not in words[2:5], str(int(channel)))
-            )
+            received = b"tx" not in words[2:5]
+            return checked(LogFrame(time_ns, error_frame(), received, str(int(channel))))
         if is_fd:
             return self._fd_frame(time_ns, line, words[2:])
         if len(words) > 4 and words[3] in _DIRECTIONS:
@@ -111,7 +118,9 @@ class AscReader(TextReader):
         number, extended = self._id(id_word, line)
         if rest[0] not in (b"0", b"1"):
             del rest[0]  # the symbolic name
-        code, length, data = int(rest[2], 16), int(rest[3]), rest[4:]
+        code = int(rest[2], 16)
+        length = int(rest[3])
+        data = rest[4:]
         if code and not length:
             frame = remote_frame(number, code, extended)
         else:
@@ -124,27 +133,38 @@ class AscReader(TextReader):
         return bytes(int(byte, self._base) for byte in words[:length])
 
     def _id(self, word: bytes, line: bytes) -> tuple[int, bool]:
-        """The id, and whether it has 29 bits. ``word`` may be a name; then the line ends with the id."""
+        """Return the id, and True if it has 29 bits.
+
+        If ``word`` is a name, the line ends with the id.
+        """
         extended = word.endswith(b"x")
         stated = _decimal_id(line) if b"=" in line else None
         if stated is None:
             return int(word.removesuffix(b"x"), self._base), extended
         number = int(stated[1])
-        with_base = "X" if self._base == 16 else "d"
-        if word.removesuffix(b"x").lstrip(b"0").upper() == format(number, with_base).encode():
+        written = word.removesuffix(b"x").lstrip(b"0").upper()
+        if written == format(number, "X" if self._base == 16 else "d").encode():
             return number, extended
         return number, bool(stated[2]) or number > 0x7FF
 
 
 def asc_time(words: list[str]) -> _Moment | None:
-    """Local time and its nanoseconds of ``Nov 14 10:13:20.123 pm 2023``; None if it is not a date."""
+    """Return local time and nanoseconds of a date. None if it is not a date.
+
+    For example ``Nov 14 10:13:20.123 pm 2023``.
+    """
     try:
         month, day, clock, *half, year = words
         hour, minute, second = clock.split(":")
         second, _, fraction = second.partition(".")
-        hours = int(hour) % 12 + 12 * (half == ["pm"]) if half else int(hour)
+        hours = int(hour)
+        if half:
+            hours %= 12
+            if half == ["pm"]:
+                hours += 12
         name = _GERMAN_MONTHS.get(month[:3], month[:3])
-        date = int(year), _MONTHS.index(name) + 1, int(day)
+        month_number = _MONTHS.index(name) + 1
+        date = (int(year), month_number, int(day))
         moment = datetime(*date, hours, int(minute), int(second))  # noqa: DTZ001  local
         moment.timestamp()
         return moment, int(fraction.ljust(9, "0")[:9])
@@ -158,10 +178,10 @@ def _unix_ns(started: _Moment) -> int:
 
 
 def _time_zero(began: _Moment, written: _Moment, first_s: float) -> _Moment:
-    """The moment from which the times count, which the file does not state.
+    """Return the time from which the times in the file count. The file does not contain it.
 
-    It is the beginning of the block, the date of the file, or midnight: the one from which the first
-    frame is closest to the beginning of the block.
+    It is the beginning of the block, the date of the file, or midnight. The result is the one with
+    which the time of the first frame is closest to the beginning of the block.
     """
     midnight = began[0].replace(hour=0, minute=0, second=0), 0
 

@@ -1,26 +1,29 @@
-"""Channels of a log in another format: numbers from 1, or names as candump has them."""
+"""Converts the channels of a log for another format: numbers from 1, or names as in candump."""
 
 import re
 
 _LARGEST = 255
-"""Largest number that every format can hold."""
+"""Largest number that is possible in every format."""
 _number_in = re.compile(r"(\d{1,3})$").search
 
 
 class Channels:
-    """Gives each channel a number or a name of its own, in the order in which they appear.
+    """Gives each channel a distinct number or name, in the order in which channels appear.
 
-    can0 is 1, and the reverse. A number that is taken, or that the format cannot hold, is replaced
-    by the lowest free one. ``own``: name of the gateway's own bus, which is number 1.
+    can0 becomes 1, and 1 becomes can0. A number that is taken, or too large for the format, is
+    replaced by the lowest free number. ``own`` is the name of the gateway's own bus, whose number
+    is 1.
     """
 
     def __init__(self, own: str) -> None:
         self._own = own
         self._numbers: dict[str, int] = {}
+        """The given numbers by channel."""
         self._names: dict[str, str] = {}
+        """The given names by channel."""
 
     def number_of(self, channel: str) -> int:
-        """The channel's number in formats that have numbers."""
+        """Return the channel's number, for formats with numbers."""
         if channel not in self._numbers:
             taken = set(self._numbers.values())
             wanted = _natural_number(channel)
@@ -30,7 +33,7 @@ class Channels:
         return self._numbers[channel]
 
     def name_of(self, channel: str) -> str:
-        """The channel's name in formats that have names."""
+        """Return the channel's name, for formats with names."""
         if channel not in self._names:
             name = channel or self._own
             if channel.isdigit():
@@ -43,7 +46,7 @@ class Channels:
 
     @property
     def changes(self) -> str:
-        """The channels whose names changed, as "can0 is 1, can1 is 2"; empty for can0 alone."""
+        """The changed channels, for example "can0 is 1, can1 is 2". Empty for can0 alone."""
         given = self._names or self._numbers
         changed = {old: new for old, new in given.items() if old and old != str(new)}
         if [*changed] in (["can0"], ["1"]):

@@ -1,7 +1,8 @@
-"""Readers of BLF and MF4 by python-can (MF4: and asammdf, an extra), which end at the first damage.
+"""Readers of BLF and MF4, which use python-can. MF4 also needs asammdf, an extra.
 
-python-can reads a BLF object of size 0 for ever (its issue 1584): here it is not given such an object. Its times are floats: here they
-count from the log's start.
+They end at the first damage. python-can would read a BLF object of size 0 for ever (its issue
+1584), so such objects are not passed to it. Its times are floats, so they count from the log's
+start.
 """
 
 import gc
@@ -33,24 +34,27 @@ with without_asammdf():
 if TYPE_CHECKING:
     from can import Message
 
-logging.getLogger("can.io").setLevel(logging.CRITICAL)  # what it says is said here
-_MIN_OBJECT, _MAX_OBJECT = 32, 1 << 20
-"""Bytes of an object in a container of a BLF file: a larger one would gather all that follows it."""
+logging.getLogger("can.io").setLevel(logging.CRITICAL)  # the readers here report its problems
+_MIN_OBJECT = 32
+_MAX_OBJECT = 1 << 20
+"""Limits of an object's size in a BLF container. A larger object would contain all later ones."""
 _ERROR_OBJECTS = tuple(number.to_bytes(4, "little") for number in (2, 104))
 """Types CAN_ERROR and CAN_FD_ERROR_64, which python-can does not read."""
-_STEP_FRAMES, _STEP_S = 10, 0.1
-"""As in log_clock.py."""
+_STEP_FRAMES = 10
+_STEP_S = 0.1
+"""The same limits as in log_clock.py."""
 _MS = 1_000_000
 
 
 class LibraryReader(LogReader):
-    """Frames of a log by one of python-can's readers."""
+    """A log that is read by one of python-can's readers."""
 
     _reader: Any = None
     _first_channel = 0
 
     def __iter__(self) -> Iterator[LogFrame]:
-        done = wrong = 0
+        done = 0
+        wrong = 0
         try:
             with warnings.catch_warnings(action="ignore"):
                 for message in self._reader or ():
@@ -59,18 +63,21 @@ class LibraryReader(LogReader):
                         yield frame_of(message, self._first_channel)
                     except ValueError:
                         wrong += 1
-        except Exception as error:  # whatever a damaged file makes of it
+        except Exception as error:  # a damaged file can cause any exception
             self.damage.append(f"damaged after {done} frames ({_short(error)})")
         if wrong:
-            self.damage.append(f"{wrong} damaged frame{'s' if wrong > 1 else ''} left out")
+            noun = "damaged frames" if wrong > 1 else "damaged frame"
+            self.damage.append(f"{wrong} {noun} left out")
 
 
 class _SoundObjects(BLFReader):
-    """python-can's reader, given only objects that it gets past."""
+    """python-can's reader, which receives only objects that it can read or skip."""
 
     def _parse_container(self, data: bytes) -> "Iterator[Message]":
-        data, self._tail = self._tail + data, b""
-        at = begin = 0
+        data = self._tail + data
+        self._tail = b""
+        at = 0
+        begin = 0
         while (found := data.find(b"LOBJ", at, at + 8)) >= 0 and found + 12 <= len(data):
             size = int.from_bytes(data[found + 8 : found + 12], "little")
             if not _MIN_OBJECT <= size <= _MAX_OBJECT:
@@ -86,7 +93,10 @@ class _SoundObjects(BLFReader):
 
 
 def _error_message(data: bytes) -> "Message":
-    """The error frame of an object that python-can does not read. The channel follows its header."""
+    """Return the error frame of an object that python-can does not read.
+
+    The channel is the first byte after the object's header.
+    """
     from can import Message
 
     (header_size,) = struct.unpack_from("<H", data, 4)
@@ -96,23 +106,26 @@ def _error_message(data: bytes) -> "Message":
 
 
 class BlfReader(LibraryReader):
-    """BLF."""
+    """The reader of BLF."""
 
-    _first_channel = 1  # python-can subtracts it
+    _first_channel = 1  # python-can subtracts 1
 
     def __init__(self, file: BinaryIO) -> None:
         super().__init__(file)
         size = os.fstat(file.fileno()).st_size
         try:
-            self._reader = reader = _SoundObjects(file)
+            reader = _SoundObjects(file)
         except (BLFParseError, struct.error, ValueError, OverflowError):
             self.damage.append("its header is damaged")
             return
+        self._reader = reader
         if size < reader.file_size < 1 << 48:
             sizes = f"{size} of its {reader.file_size} bytes are there"
             self.damage.append(f"the file is cut off: {sizes}")
-        elif problem := _faulty_size(file, size):
-            self.damage.append(problem)
+        else:
+            problem = _container_problem(file, size)
+            if problem:
+                self.damage.append(problem)
         if reader.start_timestamp >= OLDEST_WALL_S:
             self.wall_start_ns = round(reader.start_timestamp * 1000) * _MS
         reader.start_timestamp = 0.0
@@ -123,9 +136,13 @@ class BlfReader(LibraryReader):
             self.damage.append("the last frame is cut off")
 
 
-def _faulty_size(file: BinaryIO, end: int) -> str | None:
-    """What is wrong with the size of a container, which python-can believes; the file stays where it is."""
-    first = at = file.tell()
+def _container_problem(file: BinaryIO, end: int) -> str | None:
+    """Return the problem of a container with an impossible size. None if there is none.
+
+    python-can does not check the sizes. The position in the file is not changed.
+    """
+    first = file.tell()
+    at = first
     problem = None
     while problem is None and len(head := file.read(16)) == 16 and head.startswith(b"LOBJ"):
         size = int.from_bytes(head[8:12], "little")
@@ -137,24 +154,32 @@ def _faulty_size(file: BinaryIO, end: int) -> str | None:
 
 
 class Mf4Reader(LibraryReader):
-    """MF4 bus logging. RunError where asammdf is missing or cannot read it; UserError for a table."""
+    """The reader of MF4 bus logging.
+
+    Raises RunError if asammdf is missing or cannot read the file, and UserError for a table.
+    """
 
     def __init__(self, file: BinaryIO) -> None:
         super().__init__(file)
         path = Path(file.name)
-        self._reader = reader = _opened(_reader_in_order(mf4_library()), path)
-        start = reader._mdf.header.start_time.timestamp()
+        reader = _opened(_reader_in_order(mf4_library()), path)
+        self._reader = reader
+        start_s = reader._mdf.header.start_time.timestamp()
         groups = [group for group in reader._mdf.groups if group.channel_group.cycles_nr]
-        names = {channel.name for group in groups for channel in group.channels}
+        names: set[str] = set()
+        for group in groups:
+            names.update(channel.name for channel in group.channels)
         if groups and not any(name.startswith("CAN_") for name in names):
             self.close()
             raise UserError(
-                f"{path}: is a table of values (an MF4 measurement), no log of a CAN bus. Give the recording it was made of."
+                f"{path}: is a table of values (an MF4 measurement), no log of a CAN bus. "
+                "Give the recording it was made of."
             )
-        if start >= OLDEST_WALL_S:
-            # a file may say local time, which asammdf works out; the exact fraction of a second is in the number
-            fraction = int(reader._mdf.header.abs_time) % SECOND_NS
-            self.wall_start_ns = round(start - fraction / SECOND_NS) * SECOND_NS + fraction
+        if start_s >= OLDEST_WALL_S:
+            # asammdf converts local times, but only ``abs_time`` has the exact fraction of a second
+            fraction_ns = int(reader._mdf.header.abs_time) % SECOND_NS
+            whole_s = round(start_s - fraction_ns / SECOND_NS)
+            self.wall_start_ns = whole_s * SECOND_NS + fraction_ns
         reader._start_timestamp = 0.0
 
     def close(self) -> None:
@@ -163,23 +188,24 @@ class Mf4Reader(LibraryReader):
 
 
 def mf4_library() -> Any:
-    """python-can's module for MF4. RunError where asammdf is not installed."""
+    """Return python-can's module for MF4. Raises RunError if asammdf is not installed."""
     try:
         import asammdf  # noqa: F401
     except ImportError:
         raise missing_library("MF4", "mf4") from None
-    # what it says is said again by us, in one line
+    # the readers here report its problems in one line
     logging.getLogger("asammdf").setLevel(logging.CRITICAL + 1)
     library = importlib.import_module("can.io.mf4")
-    # imported without it, for a quick start
-    return importlib.reload(library) if library.asammdf is None else library
+    if library.asammdf is None:  # it was imported without asammdf for a quick start
+        return importlib.reload(library)
+    return library
 
 
 def _reader_in_order(library: Any) -> Any:
-    """python-can's reader of MF4, with the records of each group in the order of their times."""
+    """Return python-can's reader of MF4, with the records of each group sorted by time."""
 
     class InOrder:
-        """Part of an iterator over the records of a group."""
+        """A mixin of python-can's iterators over the records of a group."""
 
         _mdf: Any
         _group_index: int
@@ -194,7 +220,8 @@ def _reader_in_order(library: Any) -> Any:
                 order = _order_of(self._mdf.get_master(self._group_index))
                 if order is not None:
                     data = self._mdf.get(self._name, self._group_index, raw=False)
-                    samples, times = data.samples[order], data.timestamps[order]
+                    samples = data.samples[order]
+                    times = data.timestamps[order]
                     self._sorted = type(data)(samples, times, name=self._name)
             if self._sorted is None:
                 return super()._get_data(offset)  # type: ignore[misc]
@@ -203,7 +230,7 @@ def _reader_in_order(library: Any) -> Any:
             return type(data)(data.samples[part], data.timestamps[part], name=self._name)
 
     class Reader(library.MF4Reader):  # type: ignore[misc]
-        """python-can makes its iterators by these names."""
+        """A reader whose iterators, found by their names, are the sorted ones."""
 
     for name in ("_CANDataFrameIterator", "_CANErrorFrameIterator", "_CANRemoteFrameIterator"):
         made = getattr(library.MF4Reader, name)
@@ -212,44 +239,51 @@ def _reader_in_order(library: Any) -> Any:
 
 
 def _order_of(times: Any) -> Any:
-    """Indices of times (s, numpy) in ascending order; None if they are.
+    """Return the indices of times (s, numpy) in ascending order. None if they are in order.
 
-    If the clock was set back the times before the step stay in front of the others: ten of them, of
-    which one may be wrong, are more than 100 ms later than the ten after it.
+    If the clock was set back, the times before the step stay before the others. A step is a place
+    at which ten times are more than 100 ms later than the next ten. One of them may be wrong.
     """
     import numpy as np
 
     falls = np.flatnonzero(np.diff(times) < 0) + 1
     if not len(falls):
         return None
-    steps = [
-        at
-        for at in falls
-        if at >= _STEP_FRAMES
-        and len(times) - at >= _STEP_FRAMES
-        and np.sort(times[at - _STEP_FRAMES : at])[-2] - _STEP_S
-        > times[at : at + _STEP_FRAMES].max()
-    ]
-    parts = np.split(np.arange(len(times)), steps)
-    return np.concatenate([part[np.argsort(times[part], kind="stable")] for part in parts])
+    steps = []
+    for at in falls:
+        before = times[max(0, at - _STEP_FRAMES) : at]
+        after = times[at : at + _STEP_FRAMES]
+        if len(before) < _STEP_FRAMES or len(after) < _STEP_FRAMES:
+            continue
+        second_latest = np.sort(before)[-2]
+        if second_latest - _STEP_S > after.max():
+            steps.append(at)
+    sorted_parts = []
+    for part in np.split(np.arange(len(times)), steps):
+        order = np.argsort(times[part], kind="stable")
+        sorted_parts.append(part[order])
+    return np.concatenate(sorted_parts)
 
 
 def _opened(mf4_reader: Any, path: Path) -> Any:
-    """The reader; RunError where asammdf cannot read the file."""
-    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    """Return an open reader. Raises RunError if asammdf cannot read the file."""
+    hook = sys.unraisablehook
+    sys.unraisablehook = lambda _: None
     try:
         with warnings.catch_warnings(action="ignore"):
             reader = mf4_reader(os.fspath(path))
             reader._mdf.header.start_time.timestamp()
             return reader
-    except Exception as error:  # whatever a damaged file makes of it
+    except Exception as error:  # a damaged file can cause any exception
         reason = _short(error)
     finally:
-        gc.collect()  # what is half made complains when it is thrown away
+        gc.collect()  # incomplete objects would print errors later, when they are deleted
         sys.unraisablehook = hook
     raise RunError(f"{path}: cannot be read as MF4: {reason}.")
 
 
 def _short(error: Exception) -> str:
-    """A library's complaint in a few words."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:160].rstrip(".")
+    """Return the first line of a library's error, or its type."""
+    lines = str(error).strip().splitlines()
+    text = lines[0] if lines else type(error).__name__
+    return text[:160].rstrip(".")

@@ -1,7 +1,8 @@
-"""Readers of candump logs and PEAK TRC. A line that cannot be read is counted, the next one is read again.
+"""Readers of candump logs and PEAK TRC. asc.py reads ASC.
 
-Times stay whole numbers of nanoseconds, in TRC of microseconds. python-can reads the lines of TRC. Events other than frames are
-left out. ASC: asc.py.
+A damaged line is counted, and reading continues with the next line. Times are whole numbers of
+nanoseconds, in TRC of microseconds. python-can reads the lines of TRC. Events other than frames are
+left out.
 """
 
 import io
@@ -17,50 +18,60 @@ from kontronik_can_gw.light_imports import without_asammdf
 
 SECOND_NS = 1_000_000_000
 OLDEST_WALL_S = 631_152_000
-"""1990: what is earlier is no Unix time but seconds since a start."""
+"""1990. Earlier times are not Unix times, but seconds since a start."""
 MAX_S = 1 << 31
-"""A time of a frame is shorter; python-can gives any number, infinite ones too."""
+"""Limit of a frame's time. python-can returns any number, also infinite ones."""
 _EXACT_S = 1 << 22
-"""From here on a float of seconds is no longer exact to the nanosecond."""
+"""A float of at least this many seconds is not exact to the nanosecond."""
 LONGEST_LINE = 4096
-"""Bytes; a line of any of these formats is far shorter."""
+"""Bytes. The lines of all these formats are far shorter."""
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 _BUS_ERROR = 0x80
 _HEAD_LINES = 200
-"""Lines in which a log's head is looked for."""
+"""Number of lines that may contain a log's head."""
 _SHOWN = 8
+"""Number of damaged lines that are listed."""
+_new = tuple.__new__
+"""Makes a named tuple in half the time."""
 
 
 def checked(item: LogFrame) -> LogFrame:
-    """The frame. ValueError where none with this id and number of bytes exists on a CAN bus, or its time is no log's."""
-    frame, size = item.frame, len(item.frame.data)
+    """Return the frame, if it is possible.
+
+    Raises ValueError if its id or its number of bytes is impossible on a CAN bus, or its time in a
+    log.
+    """
+    frame = item.frame
+    size = len(frame.data)
     can_id = frame.can_id
     if can_id & ERROR:
         can_id &= ~ERROR
-        in_range = 0 <= can_id <= MAX_EXTENDED_ID and not frame.extended
+        has_valid_id = 0 <= can_id <= MAX_EXTENDED_ID and not frame.extended
     else:
-        in_range = 0 <= can_id <= (MAX_EXTENDED_ID if frame.extended else 0x7FF)
-    is_long = item.time_ns > LATEST_NS
-    if is_long or not in_range or not (size in FD_LENGTHS if frame.fd else size <= 8):
+        has_valid_id = 0 <= can_id <= (MAX_EXTENDED_ID if frame.extended else 0x7FF)
+    has_valid_size = size in FD_LENGTHS if frame.fd else size <= 8
+    if item.time_ns > LATEST_NS or not has_valid_id or not has_valid_size:
         raise ValueError
     return item
 
 
 def frame_of(message: Any, first_channel: int = 0) -> LogFrame:
-    """The frame of a message of python-can. ValueError if it is damaged.
+    """Return the frame of a message of python-can. Raises ValueError if it is damaged.
 
-    ``first_channel``: number in the log of the channel that python-can calls 0.
+    ``first_channel``: number in the log of the channel to which python-can gives the number 0.
     """
-    data, dlc = bytes(message.data), message.dlc
+    data = bytes(message.data)
+    dlc = message.dlc
     if not abs(message.timestamp) < MAX_S:
         raise ValueError
     if message.is_error_frame:
         frame = error_frame(message.arbitration_id, data)
     elif message.is_remote_frame:
         frame = remote_frame(message.arbitration_id, dlc, message.is_extended_id)
-    elif (dlc > 15 and not message.is_fd) or len(data) != (dlc if message.is_fd else min(dlc, 8)):
-        raise ValueError
     else:
+        size = dlc if message.is_fd else min(dlc, 8)
+        if len(data) != size or (dlc > 15 and not message.is_fd):
+            raise ValueError
         frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
     time_ns = round(message.timestamp * SECOND_NS)
     if abs(message.timestamp) >= _EXACT_S:
@@ -70,73 +81,119 @@ def frame_of(message: Any, first_channel: int = 0) -> LogFrame:
 
 
 def error_frame(class_: int = 0, data: bytes = b"") -> CanFrame:
-    """An error frame as SocketCAN has it: with 8 bytes, and as a bus error if no class is known."""
-    return CanFrame(ERROR | (class_ & MAX_EXTENDED_ID or _BUS_ERROR), data[:8].ljust(8, b"\0"))
+    """Return an error frame as in SocketCAN: with 8 bytes, and a bus error without a class."""
+    can_id = class_ & MAX_EXTENDED_ID or _BUS_ERROR
+    return CanFrame(ERROR | can_id, data[:8].ljust(8, b"\0"))
 
 
 def remote_frame(can_id: int, dlc: int, extended: bool) -> CanFrame:
-    """A remote frame. ValueError if the number of bytes that it asks for is impossible."""
+    """Return a remote frame. Raises ValueError if it requests an impossible number of bytes."""
     if not 0 <= dlc <= 15:
         raise ValueError
     return CanFrame(can_id, bytes(min(dlc, 8)), extended, remote=True)
 
 
 class LogReader:
-    """Gives the LogFrames of an open log. ``damage``: what is not intact, a line each; complete at its end."""
+    """An iterable of the LogFrames of an open log.
+
+    ``damage`` has a line for each damaged part. It is complete after the end of the log.
+    """
 
     wall_start_ns: int | None = None
-    """Unix time of the log's time 0; None where it does not say."""
+    """Unix time of the log's time 0. None if the log does not have it."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self.damage: list[str] = []
 
     def close(self) -> None:
-        """Release what is held beside the file."""
+        """Release all resources except the file."""
 
     def __iter__(self) -> Iterator[LogFrame]:
         raise NotImplementedError
 
 
 class TextReader(LogReader):
-    """Reads a log line by line. ``file``: buffered, at its beginning; its first buffer holds the log's head."""
+    """Reads a log line by line.
+
+    ``file`` is at its beginning. Its first buffer must contain the log's head.
+    """
 
     def __init__(self, file: BufferedReader) -> None:
         super().__init__(file)
-        self._read_head(io.BytesIO(file.peek()).readlines()[:_HEAD_LINES])
+        self._file: BufferedReader = file
+        self._line_number = 1
+        self._damaged = 0
+        """Number of damaged lines."""
+        self._last_damaged = 0
+        """Number of the last damaged line."""
+        self._shown: list[str] = []
+        """Numbers of the first damaged lines."""
+        head = io.BytesIO(file.peek()).readlines()
+        self._read_head(head[:_HEAD_LINES])
 
     def __iter__(self) -> Iterator[LogFrame]:
-        number, last, count = 1, 0, 0
-        shown: list[str] = []
         while line := self._file.readline(LONGEST_LINE):
-            try:
-                item = self._frame(line) if line.strip() else None
-                if item is not None:
-                    yield item
-            except (ValueError, LookupError):  # of numbers, texts, lengths
-                if number != last:  # a long line comes several times
-                    last, count = number, count + 1
-                    shown += [str(number)] * (count <= _SHOWN)
-            number += line.endswith(b"\n")
-        if count:
-            more = f" and {count - _SHOWN} more" if count > _SHOWN else ""
-            plural = "s" if count > 1 else ""
-            self.damage.insert(0, f"{count} damaged line{plural}: {', '.join(shown)}{more}")
+            item = self._read_line(line)
+            if item is not None:
+                yield item
+        self._describe_damage()
+
+    def _read_line(self, line: bytes) -> LogFrame | None:
+        """Return the frame of the next line, or of the next piece of a long line.
+
+        None if it does not have a frame.
+        """
+        item = None
+        number = self._line_number
+        self._line_number += line.endswith(b"\n")
+        try:
+            if line.strip():
+                item = self._frame(line)
+        except (ValueError, LookupError):  # a damaged number, text or length
+            self._note_damage(number)
+        return item
+
+    def _note_damage(self, number: int) -> None:
+        if number == self._last_damaged:  # another piece of a long line
+            return
+        self._last_damaged = number
+        self._damaged += 1
+        if self._damaged <= _SHOWN:
+            self._shown.append(str(number))
+
+    def _describe_damage(self) -> None:
+        count = self._damaged
+        if not count:
+            return
+        noun = "damaged lines" if count > 1 else "damaged line"
+        text = f"{count} {noun}: {', '.join(self._shown)}"
+        if count > _SHOWN:
+            text += f" and {count - _SHOWN} more"
+        self.damage.insert(0, text)
 
     def _read_head(self, lines: list[bytes]) -> None:
-        """Find out what the log says of itself."""
+        """Read the settings in the log's head."""
         raise NotImplementedError
 
     def _frame(self, line: bytes) -> LogFrame | None:
-        """The frame of a line, checked; None for a line without one. ValueError or LookupError if the line is damaged."""
+        """Return the checked frame of a line. None for a line without a frame.
+
+        Raises ValueError or LookupError if the line is damaged.
+        """
         raise NotImplementedError
 
 
 def nanoseconds(text: bytes) -> int:
-    """Exact nanoseconds of decimal seconds, which may be negative. ValueError."""
+    """Return decimal seconds, which may be negative, as exact nanoseconds.
+
+    Raises ValueError for other texts.
+    """
     is_negative = text.startswith(b"-")
     seconds, _, fraction = text[is_negative:].partition(b".")
-    if not (seconds.isdigit() and fraction.isdigit() and len(seconds) <= 12 and len(fraction) <= 9):
+    if not seconds.isdigit() or len(seconds) > 12:
+        raise ValueError
+    if not fraction.isdigit() or len(fraction) > 9:
         raise ValueError
     found = int(seconds + fraction.ljust(9, b"0"))
     return -found if is_negative else found
@@ -145,7 +202,7 @@ def nanoseconds(text: bytes) -> int:
 # --- candump
 
 _ID = rb"(?:(?P<error>[2367ABEFabef][0-9A-Fa-f]{7})|(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3}))"
-"""``error``: the id of an error frame, which has the bit ERROR."""
+"""``error`` is the id of an error frame, which has the bit ERROR."""
 _LINE = re.compile(
     rb"[ \t]*\((?P<time>\d+\.\d+)\)[ \t]+(?P<channel>[\x21-\x7e]{1,64})[ \t]+"
     + _ID
@@ -164,45 +221,90 @@ candump_screen_line = re.compile(
     re.MULTILINE,
 ).match
 """Matches a line of candump without ``-L``: ``(000.000000)  can0  681   [8]  00 11 22 33``."""
-_common_line = re.compile(
-    rb"\((\d{1,9}|[0-3]\d{9})\.(\d{6})\) ([\x21-\x7e]{1,64}) ([0-7][0-9A-F]{2}|[01][0-9A-F]{7})"
-    rb"#((?:[0-9A-F]{2}){0,8})(?: ([RT]))?\n"
-).fullmatch
-"""Matches most lines that candump writes. Its groups need no further check."""
-_IS_RECEIVED = {b"R": True, b"r": True, b"T": False, b"t": False, None: None}
+_split_lines = re.compile(
+    rb"\(([0-3]?\d{1,9})\.(\d{6})\) ([\x21-\x7e]{1,64}) ([0-7][0-9A-F]{2}|[01][0-9A-F]{7})"
+    rb"#([0-9A-F]{0,16})(?: ([RT]))?\n|([^\n]*\n)"
+).findall
+"""Returns a tuple for each line: the groups of a usual line, or any other line in the last group.
+
+The groups need no further check, except for an odd number of digits. Its twin is ``candump_line``,
+which reads every line, but takes five times as long (tests/recordings/test_candump_lines.py).
+"""
+_IS_RECEIVED = {b"R": True, b"r": True, b"T": False, b"t": False, b"": None, None: None}
+"""Direction by its letter. None: the line does not have a direction."""
 
 
 class CandumpReader(TextReader):
-    """``candump -L`` and ``-l``."""
+    """The reader of ``candump -L`` and ``-l``.
+
+    All complete lines in the file's buffer are read at once, which is faster than line by line. An
+    incomplete line, which is the last one in most buffers, is read alone.
+    """
 
     def _read_head(self, lines: list[bytes]) -> None:
         first = next(filter(None, map(candump_line, lines)), None)
         if first is not None and float(first["time"]) >= OLDEST_WALL_S:
             self.wall_start_ns = 0
 
-    def _frame(self, line: bytes) -> LogFrame | None:
-        if (common := _common_line(line)) is not None:
-            seconds, micros, channel, can_id, digits, direction = common.groups()
-            frame = CanFrame(int(can_id, 16), unhexlify(digits), len(can_id) == 8)
+    def __iter__(self) -> Iterator[LogFrame]:
+        file = self._file
+        while buffered := file.peek():
+            size = buffered.rfind(b"\n") + 1
+            if size:
+                yield from self._read_lines(file.read(size))
+                continue
+            item = self._read_line(file.readline(LONGEST_LINE))
+            if item is not None:
+                yield item
+        self._describe_damage()
+
+    def _read_lines(self, lines: bytes) -> Iterator[LogFrame]:
+        """Yield the frames of complete lines."""
+        last_name = b""
+        channel = ""
+        for seconds, micros, name, can_id, digits, direction, other in _split_lines(lines):
+            if other:
+                for begin in range(0, len(other), LONGEST_LINE):
+                    item = self._read_line(other[begin : begin + LONGEST_LINE])
+                    if item is not None:
+                        yield item
+                continue
+            try:
+                data = unhexlify(digits)
+            except ValueError:  # an odd number of digits
+                self._note_damage(self._line_number)
+                continue
+            finally:
+                self._line_number += 1
+            if name != last_name:
+                last_name = name
+                channel = name.decode("ascii")
+            extended = len(can_id) == 8
+            frame = _new(CanFrame, (int(can_id, 16), data, extended, False, 0, False, False))
             time_ns = int(seconds + micros) * 1000
-            return LogFrame(time_ns, frame, _IS_RECEIVED[direction], channel.decode("ascii"))
+            yield _new(LogFrame, (time_ns, frame, _IS_RECEIVED[direction], channel))
+
+    def _frame(self, line: bytes) -> LogFrame | None:
         match = candump_line(line)
         if match is None:
             raise ValueError
         found = match.groupdict()
-        data = bytes.fromhex((found["data"] or b"").decode())
+        digits = found["data"] or b""
+        data = bytes.fromhex(digits.decode())
         if found["error"]:
             frame = error_frame(int(found["error"], 16), data)
-        elif found["remote"]:
-            dlc = int(found["remote"][1:2] or b"0", 16)
-            frame = remote_frame(int(found["id"], 16), dlc, len(found["id"]) == 8)
         else:
-            is_fd = found["fd"] is not None
-            frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, is_fd)
+            can_id = int(found["id"], 16)
+            extended = len(found["id"]) == 8
+            if found["remote"]:
+                dlc = int(found["remote"][1:2] or b"0", 16)
+                frame = remote_frame(can_id, dlc, extended)
+            else:
+                frame = CanFrame(can_id, data, extended, found["fd"] is not None)
+        time_ns = nanoseconds(found["time"])
         received = _IS_RECEIVED[found["dir"]]
-        return checked(
-            LogFrame(nanoseconds(found["time"]), frame, received, found["channel"].decode("ascii"))
-        )
+        channel = found["channel"].decode("ascii")
+        return checked(LogFrame(time_ns, frame, received, channel))
 
 
 # --- PEAK TRC
@@ -211,7 +313,11 @@ _TRC_HEAD = rb";\s*(?:\$FILEVERSION|\$STARTTIME|\$COLUMNS|Start time|#{8})"
 trc_line = re.compile(_TRC_HEAD, re.IGNORECASE).match
 """Matches a line of the head."""
 _NEWER_TRC = re.compile(r"\$FILEVERSION=(?!1\.0\s)")
-"""python-can reads a file without a version as 1.0, and does not know that some say so."""
+"""A version except 1.0.
+
+python-can reads files without a version as 1.0. It does not recognise an explicit 1.0, but reads
+such files in the same way.
+"""
 
 
 _TRC_COLUMNS = {
@@ -220,11 +326,14 @@ _TRC_COLUMNS = {
     "11": {"O": 1, "T": 2},
     "13": {"O": 1, "B": 2, "T": 3},
 }
-"""Columns of time, bus, and type of an error frame, by version; later versions name them."""
+"""Columns of time, bus, and type of an error frame, by version.
+
+The head of later versions names the columns.
+"""
 
 
 class TrcReader(TextReader):
-    """PEAK TRC, file versions 1.0, 1.1, 1.3, 2.0 and 2.1."""
+    """The reader of PEAK TRC, file versions 1.0, 1.1, 1.3, 2.0 and 2.1."""
 
     def _read_head(self, lines: list[bytes]) -> None:
         with without_asammdf():
@@ -232,7 +341,8 @@ class TrcReader(TextReader):
             from can.util import dlc2len
         head = b"".join(line for line in lines if line.startswith(b";")).decode("latin-1")
         self._length_of_code = dlc2len
-        self._parser = parser = TRCReader(io.StringIO(head))
+        parser = TRCReader(io.StringIO(head))
+        self._parser = parser
         try:
             parser._extract_header()
         except (ValueError, OverflowError):
@@ -260,13 +370,15 @@ class TrcReader(TextReader):
         message = self._parser._parse_cols(columns)
         if message is None:
             return None
-        if message.is_fd:  # its length, not the code, as in other formats
+        if message.is_fd:  # other formats have the length instead of its code
             message.dlc = self._length_of_code(message.dlc)
         found = frame_of(message)
         received = found.received if self._has_direction else None
         return found._replace(time_ns=round(found.time_ns, -3), received=received)
 
     def _is_error(self, columns: Sequence[str]) -> bool:
-        """True for the line of an error frame, which python-can does not read."""
+        """Return True for the line of an error frame, which python-can does not read."""
         place = self._columns.get("T")
-        return place is not None and columns[place : place + 1] in (("ERROR",), ("Error",), ("ER",))
+        if place is None or place >= len(columns):
+            return False
+        return columns[place] in ("ERROR", "Error", "ER")

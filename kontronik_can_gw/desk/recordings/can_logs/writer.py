@@ -1,6 +1,7 @@
-"""Writes CAN frames as candump log, and as ASC, BLF, TRC or MF4 bus logging by python-can's writers.
+"""Writes CAN frames as candump log, ASC, BLF, TRC or MF4 bus logging.
 
-The same frames give the same bytes, but for MF4: no other file says when it was written.
+python-can's writers are used for all formats except candump. The same frames give the same bytes,
+except in MF4, which contains the time of writing.
 """
 
 import io
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 _MS = 1_000_000
 _LATEST_NS = 1 << 61
-"""Of what the core in C writes as text."""
+"""Latest time that the C core writes as text."""
 _DIRECTIONS = {True: " R", False: " T", None: ""}
 """Ends of the lines of candump."""
 
@@ -30,8 +31,9 @@ _DIRECTIONS = {True: " R", False: " T", None: ""}
 class CanLogWriter:
     """Writes one log.
 
-    ``file``: open for bytes, stays open. ``wall_ns``: Unix time at ``origin_ns``, the log's time 0; None where unknown.
-    ``provenance``: for the header of MF4, as it is known at the end.
+    ``file`` must be open for bytes, and is not closed. ``wall_ns`` is the Unix time at
+    ``origin_ns``, the log's time 0, or None if it is unknown. ``provenance`` is written into the
+    header of MF4 at the end.
     """
 
     write: "Callable[[Batch], None]"
@@ -47,16 +49,17 @@ class CanLogWriter:
         provenance: Mapping[str, str] | None = None,
     ) -> None:
         self.left_out: Counter[str] = Counter()
-        """Number of frames that the format does not know, by their kind."""
+        """Number of frames that the format does not support, by their kind."""
         self.close: Callable[[], object] = lambda: None
-        """Write what is held back, and the end. The file stays open."""
+        """Write the buffered data and the end of the log. The file is not closed."""
         self.discard: Callable[[], object] = lambda: None
-        """Release what is held, where the log is not to be kept."""
+        """Release all resources of a log that is not kept."""
         self.channels = Channels(channel)
         """The numbers or names of the channels that have been written."""
-        self._base_ns, start_ns = origin_ns, 0
+        self._base_ns = origin_ns
+        start_ns = 0
         if wall_ns is not None:
-            # Vector's and PEAK's headers count milliseconds, those of MF4 are read as microseconds
+            # the headers of Vector and PEAK have milliseconds, and asammdf reads microseconds
             unit = 1000 if format_ == "mf4" else _MS
             start_ns = wall_ns // unit * unit
             self._base_ns = start_ns - wall_ns + origin_ns
@@ -87,7 +90,7 @@ class CanLogWriter:
                 content = data.hex().upper()
                 if frame.remote:
                     content = f"R{len(data) or ''}"
-                elif fd:  # with a switched bit rate, as the gateway sends them
+                elif fd:  # the gateway sends such frames with a switched bit rate
                     content = f"#1{content}"
                 end = _DIRECTIONS[received]
                 stamp = f"({us // 1000000}.{us % 1000000:06d}) {name_of(channel)}"
@@ -98,8 +101,8 @@ class CanLogWriter:
     def _asc(self, file: IO[bytes], start_ns: int | None) -> None:
         with without_asammdf():
             from can import ASCWriter
-        # python-can's header has the time of writing, and cuts zeros of the milliseconds
-        # local time, as ASC has it
+        # python-can's header is not used, because it has the time of writing and cuts zeros of the
+        # milliseconds; times in ASC are local times
         moment = datetime(1970, 1, 1)  # noqa: DTZ001
         if start_ns is not None:
             moment = datetime.fromtimestamp(start_ns // SECOND_NS)  # noqa: DTZ006
@@ -108,8 +111,11 @@ class CanLogWriter:
         writer = ASCWriter(io.StringIO())
         writer.file = text
         writer.header_written = True
-        head = f"date {stamp}\nbase hex  timestamps absolute\ninternal events logged\nBegin Triggerblock {stamp}\n"
-        text.write(head + f"{0.0: 9.6f} Start of measurement\n")
+        head = (
+            f"date {stamp}\nbase hex  timestamps absolute\ninternal events logged\n"
+            f"Begin Triggerblock {stamp}\n{0.0: 9.6f} Start of measurement\n"
+        )
+        text.write(head)
         self._through(writer.on_message_received)
         self.close = lambda: (text.write("End TriggerBlock\n"), text.detach())
         self.discard = text.detach
@@ -119,7 +125,7 @@ class CanLogWriter:
             from can import BLFWriter
         writer = BLFWriter(_Unclosed(file))
         writer.start_timestamp = 0.0
-        # half a nanosecond more: the writer cuts where it should round
+        # half a nanosecond is added, because the writer cuts the fraction instead of rounding
         self._through(writer.on_message_received, 0.5)
 
         def close() -> None:
@@ -145,7 +151,7 @@ class CanLogWriter:
                 self.left_out["error frame"] += 1
             elif message.is_fd:
                 self.left_out["CAN FD frame"] += 1
-            elif message.is_remote_frame:  # python-can does not write these
+            elif message.is_remote_frame:  # python-can does not write remote frames
                 number = int(cast(int, message.channel)) + 1
                 line = writer._format_message(message, number).replace(" DT ", " RR ", 1)
                 writer.msgnr += 1
@@ -165,22 +171,24 @@ class CanLogWriter:
         header.start_time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(
             microseconds=start_ns // 1000
         )
-        header.abs_time = start_ns  # asammdf itself goes through a float
-        writer._start_time = writer.last_timestamp = 0.0
+        header.abs_time = start_ns  # asammdf itself would convert it to a float
+        writer._start_time = 0.0
+        writer.last_timestamp = 0.0
 
         def take(message: "Message") -> None:
-            # a master channel only rises
+            # the times of a master channel must not decrease
             message.timestamp = max(message.timestamp, writer.last_timestamp)
             writer.on_message_received(message)
 
         def close() -> None:
             header.comment = "\n".join(f"{key}: {value}" for key, value in provenance.items())
             with warnings.catch_warnings(action="ignore"):
-                writer._mdf.save(file, compression=2)  # stop() closes the file
+                writer._mdf.save(file, compression=2)  # stop() would close the file
                 writer._mdf.close()
 
         self._through(take, first_channel=1)
-        self.close, self.discard = close, writer._mdf.close
+        self.close = close
+        self.discard = writer._mdf.close
 
     def _through(
         self,
@@ -188,10 +196,10 @@ class CanLogWriter:
         more_ns: float = 0.0,
         first_channel: int = 0,
     ) -> None:
-        """Write with one of python-can's writers.
+        """Write frames with one of python-can's writers.
 
-        Times are seconds since the start of the log, which a float holds exactly enough.
-        ``first_channel``: the number that the writer expects for channel 1.
+        Times are seconds since the start of the log, for which a float is precise enough.
+        ``first_channel`` is the number that the writer expects for channel 1.
         """
         from can import Message
 
@@ -219,14 +227,14 @@ class CanLogWriter:
 
 
 def _logged(frames: "Batch") -> Iterator[LogFrame]:
-    """The frames one by one, with their channels."""
+    """Return an iterator over the frames with their channels."""
     if not isinstance(frames, list):
         return (LogFrame(time_ns, frame) for time_ns, frame in frames)
     return (item if isinstance(item, LogFrame) else LogFrame(*item) for item in frames)
 
 
 class _Unclosed:
-    """A file that does not let its writer close it."""
+    """A file whose ``close`` has no effect."""
 
     name = ""
 
@@ -237,4 +245,4 @@ class _Unclosed:
         return getattr(self._file, name)
 
     def close(self) -> None:
-        """The one who opened it closes it."""
+        """Do nothing, because the caller that opened the file closes it."""
