@@ -116,7 +116,7 @@ def test_an_export_replaces_only_with_force_and_no_input(folder: Path) -> None:
     assert run("export", "c", "-o", "fw").code == 0
     (folder / "fw" / "example_main.c").write_text("mine")
     done = run("export", "c", "--dbc", "own.dbc", "fw")
-    assert done.code == 2 and done.err.count(": exists. Give another name, or --force") == 5
+    assert done.code == 2 and done.err.count(": exists. Give another name, or --force") == 6
     assert run("export", "c", "--dbc", "own.dbc", "fw", "--force").code == 0
     assert (folder / "fw" / "example_main.c").read_text() == "mine"
     (folder / "fw" / "core.h").unlink()
