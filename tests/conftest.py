@@ -52,7 +52,7 @@ def pytest_collection_finish() -> None:
 TESTS = Path(__file__).parent
 ON_BOTH_CORES = (
     "gateway",
-    "golden/test_golden.py::test_no_frame_has_changed",
+    "golden/test_golden.py::test_frames_have_not_changed",
     "dbc/test_schedule_and_messages.py",
     "dbc/test_binding.py",
     "capture/test_replay_is_identical.py",

@@ -1,4 +1,7 @@
-"""Command lines and what they give, as text (README.md). ``play`` writes the results anew."""
+"""Command lines and their results, as text (see README.md).
+
+``play`` runs the command lines of a file and returns it with the current results.
+"""
 
 import io
 import logging
@@ -17,17 +20,25 @@ import scenario
 
 HERE = Path(__file__).parent
 LINES = 25
-"""Lines on standard error that are shown."""
+"""Most lines of standard error that are recorded."""
 SURROUNDINGS = (
-    *("LISTEN_FDS", "NOTIFY_SOCKET", "JOURNAL_STREAM"),
-    *("STATE_DIRECTORY", "RUNTIME_DIRECTORY", "NO_COLOR"),
+    "LISTEN_FDS",
+    "NOTIFY_SOCKET",
+    "JOURNAL_STREAM",
+    "STATE_DIRECTORY",
+    "RUNTIME_DIRECTORY",
+    "NO_COLOR",
 )
+"""Environment variables that are removed because they change the output."""
 _RESULT = re.compile(r"(\||!|=>) ?")
 _WORD = re.compile(r"'([^']*)'|(\S+)")
 
 
 def cases(text: str) -> dict[str, list[str]]:
-    """The lines of each case by its title; what stands in front of the first one under an empty title."""
+    """Return the lines of each case by its title.
+
+    The lines before the first title are found under "".
+    """
     found: dict[str, list[str]] = {"": []}
     title = ""
     for line in text.removesuffix("\n").split("\n"):
@@ -39,7 +50,7 @@ def cases(text: str) -> dict[str, list[str]]:
 
 
 def play(text: str) -> str:
-    """The file with the results of now."""
+    """Return the file's text with the current results."""
     out: list[str] = []
     for lines in cases(text).values():
         with _place() as folder:
@@ -72,7 +83,11 @@ def _play_case(lines: list[str], folder: Path) -> Iterator[str]:
 
 
 def _content(source: str, body: list[str]) -> bytes:
-    """A file's content: its lines; hexadecimal bytes; a file of inputs/ or captures/ as it is, or with other lines; bytes of a flight."""
+    """Return the content of a file that a case describes.
+
+    It consists of its lines, of hexadecimal bytes, of the bytes of a flight, or of a file in
+    inputs/ or captures/, which may have been edited.
+    """
     if not source:
         return ("\n".join(body) + "\n").encode()
     if source == "hex":
@@ -84,18 +99,28 @@ def _content(source: str, body: list[str]) -> bytes:
         return flight_bytes(HERE / file, int(esc or 1))
     else:
         base = (HERE / source).read_bytes()
-    return _edited(base.decode("latin-1"), body).encode("latin-1") if body else base
+    if not body:
+        return base
+    return _edited(base.decode("latin-1"), body).encode("latin-1")
 
 
 def flight_bytes(file: Path, esc: int) -> bytes:
-    """All bytes that an ESC sends in a flight."""
-    lines = scenario.split(file.read_text(encoding="utf-8"))[1]
-    given = [line.split()[3:] for line in lines if line.split()[1:3] == ["uart", str(esc)]]
-    return b"".join(map(scenario.uart_bytes, given))
+    """Return all bytes that an ESC sends in a flight."""
+    _, lines = scenario.split(file.read_text(encoding="utf-8"))
+    found = b""
+    for line in lines:
+        words = line.split()
+        if words[1:3] == ["uart", str(esc)]:
+            found += scenario.uart_bytes(words[3:])
+    return found
 
 
 def _edited(text: str, edits: list[str]) -> str:
-    """``@ line``: go to the next line that is this; ``- line``: remove the next one that is this; ``+ line``: put this here."""
+    """Apply edits to a text.
+
+    ``@ line`` goes behind the next line with this text, ``- line`` removes the next line with this
+    text, and ``+ line`` inserts a line.
+    """
     newline = "\r\n" if "\r\n" in text else "\n"
     lines = text.split(newline)
     at = 0
@@ -116,7 +141,8 @@ def _edited(text: str, edits: list[str]) -> str:
 def _run(line: str, folder: Path) -> Iterator[str]:
     line, _, how = line.partition(" | ")
     words = [quoted or plain for quoted, plain in _WORD.findall(line)]
-    out, err = io.TextIOWrapper(io.BytesIO(), "utf-8"), io.StringIO()
+    out = io.TextIOWrapper(io.BytesIO(), "utf-8")
+    err = io.StringIO()
     code = 0
     if words[0] == "cat":
         if not (folder / words[1]).is_file():
@@ -132,12 +158,12 @@ def _run(line: str, folder: Path) -> Iterator[str]:
                 print(f"Traceback: {error!r}", file=err)
     out.flush()
     data = out.buffer.getvalue()
-    shown = (
-        meaning.FORMS[how](data)
-        if how and data and code == 0
-        else data.decode("utf-8").splitlines()
-    )
-    talk = [text for text in err.getvalue().splitlines() if not text.startswith(("usage: ", "  "))]
+    if how and data and code == 0:
+        shown = meaning.FORMS[how](data)
+    else:
+        shown = data.decode("utf-8").splitlines()
+    lines = err.getvalue().splitlines()
+    talk = [text for text in lines if not text.startswith(("usage: ", "  "))]
     if len(talk) > LINES:
         talk[LINES:] = [f"... and {len(talk) - LINES} more lines"]
     yield from (f"| {_neutral(text, folder)}".rstrip() for text in shown)
@@ -146,10 +172,11 @@ def _run(line: str, folder: Path) -> Iterator[str]:
 
 
 def _neutral(text: str, folder: Path) -> str:
-    """Without what depends on this machine or on the version."""
-    for real, instead in ((f"{folder}/", ""), (str(folder), "."), *drive.FOLDERS.items()):
-        text = text.replace(real, instead)
-    # Python's versions differ
+    """Return the text without names and numbers that depend on this machine or on the version."""
+    replacements = {f"{folder}/": "", str(folder): ".", **drive.FOLDERS}
+    for real, neutral in replacements.items():
+        text = text.replace(real, neutral)
+    # argparse of some Python versions puts the choices in quotes
     text = re.sub(r"\(choose from .*\)", lambda found: found[0].replace("'", ""), text)
     text = re.sub(r", in [\d.]+ s\b", ", in TIME", text)
     return re.sub(rf"\b{re.escape(drive.VERSION)}\b", "VERSION", text)
@@ -157,9 +184,12 @@ def _neutral(text: str, folder: Path) -> str:
 
 @contextmanager
 def _place() -> Iterator[Path]:
-    """An empty folder to work in, and surroundings that are the same everywhere."""
-    before, folder_before = dict(os.environ), Path.cwd()
-    argv, stdin, handlers = sys.argv, sys.stdin, logging.root.handlers
+    """Work in an empty folder, with an environment that is the same on all machines."""
+    before = dict(os.environ)
+    folder_before = Path.cwd()
+    argv = sys.argv
+    stdin = sys.stdin
+    handlers = logging.root.handlers
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         for key in SURROUNDINGS:
@@ -169,7 +199,7 @@ def _place() -> Iterator[Path]:
         time.tzset()
         os.chdir(folder)
         sys.argv = ["kontronik-can-gw"]
-        logging.root.handlers = []  # as in a process of its own: pytest has some
+        logging.root.handlers = []  # pytest has handlers, a new process has none
         try:
             yield folder
         finally:
@@ -177,4 +207,6 @@ def _place() -> Iterator[Path]:
             os.environ.clear()
             os.environ.update(before)
             time.tzset()
-            sys.argv, sys.stdin, logging.root.handlers = argv, stdin, handlers
+            sys.argv = argv
+            sys.stdin = stdin
+            logging.root.handlers = handlers

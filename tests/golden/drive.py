@@ -1,6 +1,8 @@
-"""The adapter: all that the golden set imports or calls of the product. A rebuilding changes this file and no other of this folder.
+"""The adapter between the golden set and the product.
 
-The formats of the files are described in README.md; scenario.py and commands.py read and write them.
+Only this file of the folder imports the product. If the product is restructured, the other files
+stay as they are. README.md describes the formats of the files, which scenario.py and commands.py
+read and write.
 """
 
 import json
@@ -22,18 +24,21 @@ from kontronik_can_gw.status import CanState
 
 VERSION = kontronik_can_gw.__version__
 FOLDERS = {str(shipped("dbc").parent): "SHIPPED"}
-"""Folders of this machine that may be named in texts, and what is written instead."""
+"""Folders of this machine that texts may contain, and the words that replace them."""
 
 
 def frame(
     can_id: int, data: bytes, extended: bool = False, fd: bool = False, remote: bool = False
 ) -> CanFrame:
-    """One on the bus."""
+    """Return a frame on the bus."""
     return CanFrame(can_id, data, extended, fd, remote=remote)
 
 
 def command(words: Sequence[str]) -> int:
-    """Run one command line in this process; its exit code. It reads and writes the standard streams of ``sys``."""
+    """Run a command line in this process and return its exit code.
+
+    The command reads and writes the standard streams of ``sys``.
+    """
     try:
         return main(words)
     except SystemExit as end:
@@ -41,12 +46,15 @@ def command(words: Sequence[str]) -> int:
 
 
 def shipped_eds() -> str:
-    """The EDS in the package."""
+    """Return the text of the EDS in the package."""
     return shipped("eds/kontronik_esc.eds").read_bytes().decode("latin-1")
 
 
 def replayed(path: Path) -> Iterator[tuple[int, CanFrame, bool]]:
-    """The frames that a capture's gateway received (True) and sent, with the recorded clock in ns."""
+    """Yield the frames that a capture's gateway received (True) or sent (False).
+
+    Times are ns of the recorded clock.
+    """
     with open_input(path) as recording:
         assert isinstance(recording, CaptureInput)
         for item in recording.frames():
@@ -54,50 +62,59 @@ def replayed(path: Path) -> Iterator[tuple[int, CanFrame, bool]]:
 
 
 class Drive:
-    """A gateway on an interface that takes every frame at once, with a clock turned by hand (ns from power-on).
+    """A gateway on an interface that accepts every frame at once.
 
-    ``tables``: its configuration, as of a TOML file; ``file``: where that stands, other files are looked for beside it.
+    Callers set its clock, in ns since power-on. ``tables`` is the configuration as read from the
+    TOML file ``file``. Other files are searched for in the folder of ``file``.
     """
 
     def __init__(self, tables: Mapping[str, Any], file: Path) -> None:
         loaded = assemble(parse(dict(tables), str(file)))
-        self.warnings = [
-            line.replace(f"{file.parent}/", "")
-            for line in (*loaded.layout.warnings, *loaded.warnings)
-        ]
+        folder = f"{file.parent}/"
+        warnings = [*loaded.layout.warnings, *loaded.warnings]
+        self.warnings = [line.replace(folder, "") for line in warnings]
         silent = loaded.config.dbc.silent_on_loss
         self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.outputs)
         self._waiting = TransmitQueue()
         self._open = True
-        self._looked = self._now = 0
+        self._now = 0
+        self._looked = 0
+        """Time at which the gateway last read its clock and ports."""
 
     @property
     def deadline(self) -> int:
-        """When ``advance`` is to be called at the latest."""
+        """Latest time of the next call of ``advance``."""
         return self._gateway.next_deadline()
 
     def advance(self, now: int) -> None:
-        self._looked = self._now = now
+        self._looked = now
+        self._now = now
         self._gateway.advance(now)
 
     def uart(self, esc: int, data: bytes, now: int) -> None:
-        """Bytes that are read from the port of an ESC (0 ...). They came just now, but where a deadline was missed."""
+        """Read bytes from the port of an ESC, which is counted from 0.
+
+        The bytes arrived at ``now``. If a deadline was missed, they may be as old as the last call.
+        """
         self._now = now
         if self.deadline >= now:
             self._looked = now
         self._gateway.receive_bytes(esc, data, now, self._looked)
 
     def put(self, frame: CanFrame, now: int) -> None:
-        """A frame from the bus. What no filter lets pass the gateway is never given."""
+        """Receive a frame from the bus, unless the gateway's filters reject it."""
         self._now = now
         if frame.key in self._gateway.receive_ids:
             self._gateway.status.received_frames += 1
             self._gateway.receive_frame(frame, now, now)
 
     def happen(self, verb: str, words: Sequence[str], now: int) -> None:
-        """Anything else: see README.md."""
-        gateway, self._now = self._gateway, now
-        esc = int(words[0]) - 1 if words and words[0].isdecimal() else 0
+        """Cause any other event. README.md lists the verbs."""
+        gateway = self._gateway
+        self._now = now
+        esc = 0
+        if words and words[0].isdecimal():
+            esc = int(words[0]) - 1
         match verb:
             case "start":
                 gateway.start(now, words != ["closed"])
@@ -126,7 +143,7 @@ class Drive:
                 raise ValueError(f"what is {verb!r}?")
 
     def take(self) -> list[CanFrame]:
-        """What was sent since the last call."""
+        """Return the frames sent since the last call."""
         frames = in_order(self._gateway.take_frames(self._now), self._waiting)
         if not self._open:
             return []
@@ -134,19 +151,17 @@ class Drive:
         return frames
 
     def news(self) -> list[str]:
-        """What the gateway wants stored, or reports beside its frames, since the last call."""
+        """Return the gateway's requests to store parameters and its reports since the last call."""
         gateway = self._gateway
         found = []
         for esc, stored in gateway.take_saves():
             content = json.loads(stored.split(b"\n")[1])
             found.append(f"store {esc + 1} {json.dumps(content, sort_keys=True)}")
-        found += [
-            f"rejected {esc + 1} {key >> 8:04X}:{key & 255:02X}"
-            for esc, key in gateway.take_rejected_parameters()
-        ]
+        for esc, key in gateway.take_rejected_parameters():
+            found.append(f"rejected {esc + 1} {key >> 8:04X}:{key & 255:02X}")
         for conflict in gateway.conflicts.take():
-            found.append(
-                f"conflict {conflict.key & 0x1FFFFFFF:03X} {conflict.whose}{' is over' if conflict.over else ''}"
-            )
+            can_id = conflict.key & 0x1FFFFFFF
+            end = " is over" if conflict.over else ""
+            found.append(f"conflict {can_id:03X} {conflict.whose}{end}")
         gateway.take_link_changes()
         return found

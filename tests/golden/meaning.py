@@ -1,4 +1,7 @@
-"""Files by meaning: what stands in a DBC, an EDS, a table or a CAN log, however it is laid out. Nothing of the product is used."""
+"""The content of a DBC, an EDS, a table or a CAN log as lines of text, however it is laid out.
+
+This module does not use the product.
+"""
 
 import configparser
 import csv
@@ -9,17 +12,18 @@ import tempfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
 import can
 import cantools.database
-from cantools.database.can import Database, Message
+from cantools.database.can import Database, Message, Signal
 
 ALL_ROWS = 40
-"""Tables of at most so many rows stand there whole; of longer ones some rows and digests."""
+"""A table of at most this many rows is written whole, a longer one as some rows and digests."""
 BLOCKS = 8
+"""Parts of a long table, each of which has a digest."""
 
 
 def _digest(items: Iterable[object]) -> str:
@@ -27,7 +31,7 @@ def _digest(items: Iterable[object]) -> str:
 
 
 def spelled(text: str) -> str:
-    """One spelling of a number; any other text as it is."""
+    """Return a number in its one spelling, and any other text unchanged."""
     try:
         return str(int(text, 0))
     except ValueError:
@@ -50,42 +54,59 @@ def _attributes(holder: Any) -> str:
 
 
 def _message(message: Message) -> list[str]:
-    head = f"{message.frame_id:0{8 if message.is_extended_frame else 3}X} {message.name}: {message.length} bytes"
-    lines = [
-        f"{head}{' FD' if message.is_fd else ''} from {','.join(message.senders)}{_attributes(message)} ; {message.comment}"
-    ]
-    for s in sorted(message.signals, key=lambda signal: signal.name):
-        form = f"{s.start}|{s.length}@{'big' if s.byte_order == 'big_endian' else 'little'}{'-' if s.is_signed else '+'}"
-        form += f"{' float' if s.is_float else ''}{' M' if s.is_multiplexer else ''}{f' m{s.multiplexer_ids}' if s.multiplexer_ids else ''}"
-        scale = f"({s.scale:g},{s.offset:g}) [{s.minimum}|{s.maximum}] {s.unit or '-'} raw start {s.raw_initial}"
-        lines.append(
-            f"  {s.name} {form} {scale} to {','.join(s.receivers)}{_attributes(s)} ; {s.comment}"
-        )
-        if s.choices:
-            lines.append(
-                "    " + " ".join(f"{number}={text}" for number, text in sorted(s.choices.items()))
-            )
+    digits = 8 if message.is_extended_frame else 3
+    can_fd = " FD" if message.is_fd else ""
+    senders = ",".join(message.senders)
+    head = f"{message.frame_id:0{digits}X} {message.name}: {message.length} bytes{can_fd}"
+    lines = [f"{head} from {senders}{_attributes(message)} ; {message.comment}"]
+    for signal in sorted(message.signals, key=lambda signal: signal.name):
+        lines.append(_signal(signal))
+        if signal.choices:
+            choices = sorted(signal.choices.items())
+            lines.append("    " + " ".join(f"{number}={text}" for number, text in choices))
     return lines
 
 
+def _signal(signal: Signal) -> str:
+    order = "big" if signal.byte_order == "big_endian" else "little"
+    sign = "-" if signal.is_signed else "+"
+    form = f"{signal.start}|{signal.length}@{order}{sign}"
+    if signal.is_float:
+        form += " float"
+    if signal.is_multiplexer:
+        form += " M"
+    if signal.multiplexer_ids:
+        form += f" m{signal.multiplexer_ids}"
+    scale = f"({signal.scale:g},{signal.offset:g})"
+    limits = f"[{signal.minimum}|{signal.maximum}]"
+    numbers = f"{scale} {limits} {signal.unit or '-'} raw start {signal.raw_initial}"
+    receivers = ",".join(signal.receivers)
+    texts = f"{receivers}{_attributes(signal)} ; {signal.comment}"
+    return f"  {signal.name} {form} {numbers} to {texts}"
+
+
+def _by_id(database: Database) -> list[Message]:
+    return sorted(database.messages, key=lambda each: (each.is_extended_frame, each.frame_id))
+
+
 def dbc(data: bytes) -> list[str]:
-    """Everything: a line for each message, signal and value table, sorted by id and name."""
+    """Return all of a DBC: a line for each message, signal and value table, by id and name."""
     found = database(data)
-    lines = [f"database{_attributes(found)}"] + [
-        f"node {node.name} ; {node.comment}" for node in found.nodes
-    ]
-    for message in sorted(found.messages, key=lambda m: (m.is_extended_frame, m.frame_id)):
+    lines = [f"database{_attributes(found)}"]
+    for node in found.nodes:
+        lines.append(f"node {node.name} ; {node.comment}")
+    for message in _by_id(found):
         lines += _message(message)
     return lines
 
 
 def dbc_short(data: bytes) -> list[str]:
-    """A line for each message: what there is, and a digest of all of it."""
+    """Return a line for each message: its name, cycle and size, and a digest of its content."""
     lines = []
-    for message in sorted(database(data).messages, key=lambda m: (m.is_extended_frame, m.frame_id)):
-        lines.append(
-            f"{message.frame_id:03X} {message.name} {message.cycle_time} ms {len(message.signals)} signals {_digest(_message(message))}"
-        )
+    for message in _by_id(database(data)):
+        head = f"{message.frame_id:03X} {message.name} {message.cycle_time} ms"
+        digest = _digest(_message(message))
+        lines.append(f"{head} {len(message.signals)} signals {digest}")
     return lines
 
 
@@ -103,14 +124,14 @@ _OF_THE_DAY |= {"ModificationDate", "ModificationTime", "ModifiedBy"}
 
 
 def eds(data: bytes) -> list[str]:
-    """A line for each section: its keys sorted, numbers in one spelling."""
+    """Return a line for each section: its sorted keys, with numbers in one spelling."""
     found = _sections(data)
     lines = []
     for name in sorted(found.sections(), key=str.upper):
-        keys = {
-            key: value for key, value in found[name].items() if key not in _OF_THE_DAY and value
-        }
-        lines.append(f"[{name.upper()}] {_keys(dict(sorted(keys.items())))}")
+        section = found[name]
+        kept = [key for key in sorted(section) if section[key] and key not in _OF_THE_DAY]
+        keys = {key: section[key] for key in kept}
+        lines.append(f"[{name.upper()}] {_keys(keys)}")
     return lines
 
 
@@ -119,27 +140,37 @@ def _keys(values: Mapping[str, str]) -> str:
 
 
 def dcf(data: bytes) -> list[str]:
-    """What a DCF adds to its EDS: the sections that are about the node, and ParameterValue."""
+    """Return the lines that a DCF adds to its EDS: the sections of the node, and ParameterValue."""
     found = _sections(data)
     lines = [line for line in eds(data) if line.startswith(("[DEVICECOM", "[FILEINFO"))]
     for name in sorted(found.sections(), key=str.upper):
-        values = {k: found[name][k] for k in ("ParameterValue", "Denotation") if k in found[name]}
+        section = found[name]
+        added = [key for key in ("ParameterValue", "Denotation") if key in section]
+        values = {key: section[key] for key in added}
         if values and "Com" not in name:
             lines.append(f"[{name.upper()}] {_keys(values)}")
     return lines
 
 
 def columns(data: bytes) -> dict[str, list[str]]:
-    """A CSV table, or JSON lines, by columns; values in one spelling, nothing for what is not there."""
+    """Return the columns of a CSV table or of JSON lines.
+
+    Numbers have one spelling, and missing values are "".
+    """
     text = data.decode("utf-8")
     found: dict[str, list[str]] = {}
     if text.startswith("{"):
         rows = [json.loads(line) for line in text.splitlines()]
-        for name in dict.fromkeys(name for row in rows for name in row):
+        names: dict[str, None] = {}
+        for row in rows:
+            names |= dict.fromkeys(row)
+        for name in names:
             found[name] = [_cell(row.get(name)) for row in rows]
         return found
     head, *lines = list(csv.reader(io.StringIO(text)))
-    return {name: [spelled(line[at]) for line in lines] for at, name in enumerate(head)}
+    for at, name in enumerate(head):
+        found[name] = [spelled(line[at]) for line in lines]
+    return found
 
 
 def _cell(value: object) -> str:
@@ -149,7 +180,7 @@ def _cell(value: object) -> str:
 
 
 def _runs(values: Sequence[str]) -> str:
-    """Values in a row; `x*3` for the same three times, `-` for nothing."""
+    """Return values in one line, with `x*3` for three equal values and `-` for an empty one."""
     parts = []
     for value, same in groupby(each.replace(" ", "_") or "-" for each in values):
         count = len(list(same))
@@ -158,12 +189,16 @@ def _runs(values: Sequence[str]) -> str:
 
 
 def table(data: bytes) -> list[str]:
-    """As ``column_lines``."""
+    """Return the lines of a CSV table or of JSON lines, as ``column_lines`` does."""
     return column_lines(columns(data))
 
 
 def column_lines(found: Mapping[str, list[str]]) -> list[str]:
-    """A line for each column: its values; of a long table some of them and a digest of each eighth. Those that never change share one."""
+    """Return a line for each column, with its values.
+
+    For a long table the line has some of the values, and a digest of each eighth of them. Columns
+    that have the same value in all rows share a line.
+    """
     count = len(next(iter(found.values())))
     lines = [f"{count} rows, {len(found)} columns"]
     always: dict[str, list[str]] = {}
@@ -174,10 +209,14 @@ def column_lines(found: Mapping[str, list[str]]) -> list[str]:
         if count <= ALL_ROWS:
             lines.append(f"{name}: {_runs(values)}")
             continue
-        blocks = [values[count * n // BLOCKS : count * (n + 1) // BLOCKS] for n in range(BLOCKS)]
+        edges = [count * n // BLOCKS for n in range(BLOCKS + 1)]
+        blocks = [values[begin:end] for begin, end in pairwise(edges)]
         some = _runs([block[0] for block in blocks] + values[-1:])
-        lines.append(f"{name}: {some} / {' '.join(_digest(block)[4:] for block in blocks)}")
-    return lines + [f"always {value}: {', '.join(names)}" for value, names in always.items()]
+        digests = " ".join(_digest(block)[4:] for block in blocks)
+        lines.append(f"{name}: {some} / {digests}")
+    for value, names in always.items():
+        lines.append(f"always {value}: {', '.join(names)}")
+    return lines
 
 
 def _log(suffix: str) -> Callable[[bytes], list[str]]:
@@ -188,39 +227,48 @@ def _log(suffix: str) -> Callable[[bytes], list[str]]:
             with can.LogReader(file) as reader:
                 found = list(reader)
         first = found[0].timestamp
-        ids = Counter(f"{m.arbitration_id:03X}" for m in found)
-        frames = [
-            (m.arbitration_id, m.is_extended_id, m.is_fd, m.is_rx, bytes(m.data)) for m in found
-        ]
+        length = found[-1].timestamp - first
+        ids = Counter(f"{each.arbitration_id:03X}" for each in found)
+        frames = []
+        for each in found:
+            kind = (each.is_extended_id, each.is_fd, each.is_rx)
+            frames.append((each.arbitration_id, *kind, bytes(each.data)))
+        times = [round((each.timestamp - first) * 1e4) for each in found]
+        counts = " ".join(f"{can_id}*{count}" for can_id, count in sorted(ids.items()))
         return [
-            f"{len(found)} frames in {found[-1].timestamp - first:.4f} s, content {_digest(frames)}",
-            f"times in 0.1 ms {_digest(round((m.timestamp - first) * 1e4) for m in found)}",
-            "ids " + " ".join(f"{can_id}*{count}" for can_id, count in sorted(ids.items())),
+            f"{len(found)} frames in {length:.4f} s, content {_digest(frames)}",
+            f"times in 0.1 ms {_digest(times)}",
+            f"ids {counts}",
         ]
 
     return form
 
 
 def configuration(data: bytes) -> list[str]:
-    """A line for each key in effect."""
+    """Return a line for each key in effect."""
     tables = json.loads(data)["configuration"]
-    escs = {f"esc {number}": esc for number, esc in enumerate(tables.pop("esc"), 1)}
-    return [
-        f"{name}.{key} = {json.dumps(value, ensure_ascii=False)}"
-        for name, table in {**tables, **escs}.items()
-        for key, value in table.items()
-    ]
+    escs = tables.pop("esc")
+    for number, esc in enumerate(escs, 1):
+        tables[f"esc {number}"] = esc
+    lines = []
+    for name, keys in tables.items():
+        for key, value in keys.items():
+            lines.append(f"{name}.{key} = {json.dumps(value, ensure_ascii=False)}")
+    return lines
 
 
 def signals(data: bytes) -> list[str]:
-    """A line for each message, and for each signal: what it shows, and its meaning."""
+    """Return a line for each message, and for each signal with its value and its meaning."""
     found = json.loads(data)
     lines = []
     for message in found.get("messages", ()):
         lines.append(" ".join(f"{key}={message[key]}" for key in message if key != "meaning"))
-        for each in (s for s in found["signals"] if s["message"] == message["name"]):
+        for signal in found["signals"]:
+            if signal["message"] != message["name"]:
+                continue
             keys = ("signal", "esc", "shows", "unit", "page", "meaning")
-            lines.append("  ".join(["", *(str(each[key]) for key in keys if each[key])]))
+            cells = [str(signal[key]) for key in keys if signal[key]]
+            lines.append("  ".join(["", *cells]))
     return lines
 
 

@@ -1,6 +1,7 @@
-"""``make golden``: record the golden set anew and say what changed. With ``--check`` nothing is written, and a change is exit code 1.
+"""``make golden``: record the golden set and print the changes.
 
-Names of files, or parts of them, restrict it: ``python tests/golden/record.py flights/v4 refusals``.
+With ``--check`` nothing is written, and the exit code is 1 if anything has changed. Names of files
+or parts of names restrict the run: ``python tests/golden/record.py flights/v4 refusals``.
 """
 
 import argparse
@@ -19,41 +20,58 @@ import scenario  # noqa: E402
 
 KINDS = ("captures", "commands", "dialogues", "flights")
 LINES = 12
-"""Lines of a difference that are shown."""
+"""Most lines of one difference that are printed."""
 
 
 def files(words: Sequence[str] = ()) -> list[Path]:
-    """The golden files, those whose names hold one of the words."""
-    found = [file for kind in KINDS for file in HERE.glob(f"{kind}/*.txt")]
-    named = [(file, str(file.relative_to(HERE))) for file in sorted(found)]
-    return [file for file, name in named if not words or any(word in name for word in words)]
+    """Return the golden files whose names contain one of the words. No words: all files."""
+    found: list[Path] = []
+    for kind in KINDS:
+        found += HERE.glob(f"{kind}/*.txt")
+    chosen = []
+    for file in sorted(found):
+        name = str(file.relative_to(HERE))
+        if not words or any(word in name for word in words):
+            chosen.append(file)
+    return chosen
 
 
 def made(file: Path) -> str:
-    """What the file would hold if it were recorded now."""
-    if file.parent.name == "captures":
+    """Return the text that the file would have if it were recorded now."""
+    kind = file.parent.name
+    if kind == "captures":
         return scenario.replay(file.with_suffix(".kcap"))
     text = file.read_text(encoding="utf-8")
-    return commands.play(text) if file.parent.name == "commands" else scenario.play(text)
+    if kind == "commands":
+        return commands.play(text)
+    return scenario.play(text)
 
 
 def changes(file: Path, new: str) -> list[str]:
-    """What is different, for people: of each case its title, and lines; empty where nothing is."""
+    """Return the differences as readable lines: for each case its title and its changed lines.
+
+    Returns an empty list if nothing has changed.
+    """
     old = file.read_text(encoding="utf-8") if file.exists() else ""
-    before, after = commands.cases(old), commands.cases(new)
+    before = commands.cases(old)
+    after = commands.cases(new)
     found = []
     for title in dict.fromkeys([*before, *after]):
-        pair = before.get(title, []), after.get(title, [])
-        lines = [repr(line)[1:-1] for line in unified_diff(*pair, n=0, lineterm="")][3:]
-        if lines:
-            found.append(f"{file.relative_to(HERE)}: {title}")
-            found += [f"    {line[:300]}" for line in lines[:LINES]]
-            found += [f"    ... and {len(lines) - LINES} more lines"] * (len(lines) > LINES)
+        old_lines = before.get(title, [])
+        new_lines = after.get(title, [])
+        difference = unified_diff(old_lines, new_lines, n=0, lineterm="")
+        lines = [repr(line)[1:-1] for line in difference][3:]
+        if not lines:
+            continue
+        found.append(f"{file.relative_to(HERE)}: {title}")
+        found += [f"    {line[:300]}" for line in lines[:LINES]]
+        if len(lines) > LINES:
+            found.append(f"    ... and {len(lines) - LINES} more lines")
     return found
 
 
 def main() -> int:
-    """Record, or check."""
+    """Record or check the files that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--check", action="store_true", help="write nothing; exit code 1 if anything is different"
@@ -67,13 +85,13 @@ def main() -> int:
         new = made(file)
         found = changes(file, new)
         differing += bool(found)
-        print("".join(f"{line}\n" for line in found), end="")
+        for line in found:
+            print(line)
         if found and not args.check:
             file.write_text(new, encoding="utf-8")
     done = "differ" if args.check else "were written"
-    print(
-        f"{differing} of {len(chosen)} golden files {done} ({time.process_time() - begun:.0f} s of CPU)"
-    )
+    used = time.process_time() - begun
+    print(f"{differing} of {len(chosen)} golden files {done} ({used:.0f} s of CPU)")
     return int(args.check and differing > 0)
 
 

@@ -1,4 +1,7 @@
-"""Scenarios: what is given to a gateway and what it sends, as text with times (README.md). ``play`` writes what is sent anew."""
+"""Scenarios: the input and the output of a gateway, as lines of text with times (see README.md).
+
+``play`` runs a scenario and returns it with the current output.
+"""
 
 import re
 import struct
@@ -16,7 +19,7 @@ INPUTS = Path(__file__).parent / "inputs"
 
 
 def seconds(ns: int) -> str:
-    """Seconds with three decimals, or as many as it takes."""
+    """Return a time in seconds, with three decimals or more if the time needs them."""
     text = f"{ns // SECOND}.{ns % SECOND:09d}"
     return text[:-6] + text[-6:].rstrip("0")
 
@@ -27,47 +30,71 @@ def nanoseconds(text: str) -> int:
 
 
 def frame_text(of: CanFrame) -> str:
-    """As in a candump log: 8 digits for 29 bits, ## and flags for CAN FD, R for a remote frame."""
-    can_id = f"{of.can_id:08X}" if of.extended else f"{of.can_id:03X}"
+    """Return a frame as in a candump log.
+
+    A 29-bit id has 8 digits, CAN FD has ## and flags, and a remote frame has R.
+    """
+    digits = 8 if of.extended else 3
+    can_id = f"{of.can_id:0{digits}X}"
     if of.remote:
         return f"{can_id}#R"
-    return f"{can_id}{'##1' if of.fd else '#'}{of.data.hex().upper()}"
+    mark = "##1" if of.fd else "#"
+    data = of.data.hex().upper()
+    return f"{can_id}{mark}{data}"
 
 
 def read_frame(text: str) -> CanFrame:
     can_id, _, data = text.partition("#")
-    fd, remote = data.startswith("#"), data.startswith("R")
-    content = b"" if remote else bytes.fromhex(data[2 if fd else 0 :])
-    return frame(int(can_id, 16), content, len(can_id) > 3, fd, remote)
+    is_extended = len(can_id) > 3
+    if data.startswith("R"):
+        return frame(int(can_id, 16), b"", is_extended, remote=True)
+    is_fd = data.startswith("#")
+    digits = data[2:] if is_fd else data
+    return frame(int(can_id, 16), bytes.fromhex(digits), is_extended, is_fd)
 
 
 def uart_bytes(words: list[str]) -> bytes:
-    """Bytes in hexadecimal, or a frame: ``live`` or ``info`` (``.legacy``), then fields in steps of the wire; others are 0."""
+    """Return the bytes that the words of a ``uart`` line describe.
+
+    The words are hexadecimal digits, or they describe a frame: ``live`` or ``info``, perhaps with
+    ``.legacy``, and then fields in steps of the wire. Fields that are not given are 0.
+    """
     kind, _, layout = words[0].partition(".")
     if kind not in ("live", "info"):
         return bytes.fromhex("".join(words))
-    given = {name: int(value, 0) for name, value in (word.split("=") for word in words[1:])}
-    fields = sheet.LIVE_FIELDS if kind == "live" else sheet.INFO_FIELDS
-    assert set(given) <= {field.name for field in fields}, f"no field of the sheet: {given}"
-    body = struct.pack(
-        sheet.LIVE_STRUCT if kind == "live" else sheet.INFO_STRUCT,
-        *(given.get(f.name, 0) for f in fields),
-    )
+    given = {}
+    for word in words[1:]:
+        name, value = word.split("=")
+        given[name] = int(value, 0)
+    if kind == "live":
+        fields = sheet.LIVE_FIELDS
+        structure = sheet.LIVE_STRUCT
+    else:
+        fields = sheet.INFO_FIELDS
+        structure = sheet.INFO_STRUCT
+    names = [field.name for field in fields]
+    assert set(given) <= set(names), f"no field of the sheet: {given}"
+    values = [given.get(name, 0) for name in names]
+    body = struct.pack(structure, *values)
     row = reference.form_row(kind, layout or "v4")
     return reference.seal(row, body.ljust(row.crc_at - 4, b"\0"))
 
 
 def split(text: str) -> tuple[str, list[str]]:
-    """The configuration in front, and the lines from the first one with a time on."""
+    """Return the configuration, and all lines from the first one with a time.
+
+    Comments directly before that line are part of the lines.
+    """
     lines = text.splitlines()
-    first = next((n for n, line in enumerate(lines) if re.match(r"\d+\.\d+ ", line)), len(lines))
+    timed = (n for n, line in enumerate(lines) if re.match(r"\d+\.\d+ ", line))
+    first = next(timed, len(lines))
     while first and lines[first - 1].startswith(";"):
         first -= 1
     return "\n".join(lines[:first]) + "\n", lines[first:]
 
 
 class Player:
-    """A gateway and the time. ``out``: the lines so far."""
+    """A gateway, its clock, and in ``out`` the lines written until now."""
 
     def __init__(self, drive: Drive) -> None:
         self.drive = drive
@@ -76,51 +103,66 @@ class Player:
         self._heard: list[CanFrame] = []
 
     def pass_time(self, until: int) -> None:
-        """Advance at each deadline before ``until``."""
-        while (due := max(self.now, self.drive.deadline)) < until:
+        """Advance the gateway at each deadline before ``until``."""
+        due = max(self.now, self.drive.deadline)
+        while due < until:
             self.now = due
             self.drive.advance(due)
             assert self.drive.deadline > due, "a deadline that does not move on"
             self._collect()
             self.write_down()
+            due = max(self.now, self.drive.deadline)
 
     def input(self, time: int, verb: str, words: list[str]) -> str:
-        """One line that is given; what is to be written after it: what an SDO transfer gave."""
+        """Give one line of input to the gateway.
+
+        Returns the result of an SDO transfer, which is written at the end of the line, or "".
+        """
         self.now = time
         drive = self.drive
-        found = ""
+        result = ""
         if verb == "<-":
             drive.put(read_frame(words[0]), time)
         elif verb == "uart":
             drive.uart(int(words[0]) - 1, uart_bytes(words[1:]), time)
         elif verb in ("read", "write"):
-            found = self._sdo(verb, int(words[0]), words[1], bytes.fromhex("".join(words[2:])))
+            data = bytes.fromhex("".join(words[2:]))
+            result = self._sdo(verb, int(words[0]), words[1], data)
         elif verb not in ("-", "held"):
             drive.happen(verb, words, time)
         if verb != "held":
             drive.advance(time)
         self._collect()
-        return found
+        return result
 
     def write_down(self) -> None:
-        self.out += [f"{seconds(self.now)} -> {frame_text(sent)}" for sent in self._heard]
+        """Append the frames and the news since the last call to the lines."""
+        now = seconds(self.now)
+        for sent in self._heard:
+            self.out.append(f"{now} -> {frame_text(sent)}")
         self._heard = []
-        self.out += [f"{seconds(self.now)} => {news}" for news in self.drive.news()]
+        for news in self.drive.news():
+            self.out.append(f"{now} => {news}")
 
     def _collect(self) -> None:
         self._heard += self.drive.take()
 
     def _ask(self, node: int, request: bytes) -> bytes | None:
-        """One SDO request; its answer, taken out of what was heard."""
+        """Send one SDO request. Returns its answer and removes it from the frames heard."""
         self.drive.put(frame(0x600 + node, request), self.now)
         self._collect()
-        answers = [f.data for f in self._heard if f.can_id == 0x580 + node]
-        self._heard = [f for f in self._heard if f.can_id != 0x580 + node]
+        answer_id = 0x580 + node
+        answers = [f.data for f in self._heard if f.can_id == answer_id]
+        self._heard = [f for f in self._heard if f.can_id != answer_id]
         assert len(answers) < 2, "several answers"
         return answers[0] if answers else None
 
     def _sdo(self, verb: str, node: int, entry: str, data: bytes) -> str:
-        """A transfer, expedited or in segments: ``= data`` of a read, ``! abort code``, nothing without an answer."""
+        """Make an SDO transfer, expedited or in segments.
+
+        Returns ``= data`` for a read, ``! code`` for an abort, and "" for a write or without an
+        answer.
+        """
         index, _, sub = entry.partition(":")
         multiplexer = int(index, 16).to_bytes(2, "little") + bytes((int(sub, 16),))
         size = len(data)
@@ -133,29 +175,41 @@ class Player:
         else:
             request = b"\x21" + multiplexer + size.to_bytes(4, "little")
             parts = [data[at : at + 7] for at in range(0, size, 7)]
-        if (answer := self._ask(node, request)) is None:
+        answer = self._ask(node, request)
+        if answer is None:
             return ""
         if verb == "read" and answer[0] & 0xE2 == 0x42:
-            return f" = {answer[4 : 8 - (answer[0] >> 2 & 3)].hex().upper()}"
-        found, toggle = b"", 0
+            end = 8 - (answer[0] >> 2 & 3)
+            return f" = {answer[4:end].hex().upper()}"
+        found = b""
+        toggle = 0
         while answer[0] != 0x80 and (parts or verb == "read"):
             request = bytes((0x60 | toggle,)) + bytes(7)
             if verb == "write":
                 part = parts.pop(0)
-                head = bytes((toggle | (7 - len(part)) << 1 | (not parts),))
+                is_last = not parts
+                unused = 7 - len(part)
+                head = bytes((toggle | unused << 1 | is_last,))
                 request = head + part.ljust(7, b"\0")
             answer = self._ask(node, request) or b"\x80" + bytes(7)
-            found += answer[1 : 8 - (answer[0] >> 1 & 7)]
+            end = 8 - (answer[0] >> 1 & 7)
+            found += answer[1:end]
             toggle ^= 0x10
             if verb == "read" and answer[0] & 1:
                 break
         if answer[0] == 0x80:
-            return f" ! {int.from_bytes(answer[4:], 'little'):08X}"
-        return f" = {found.hex().upper()}" if verb == "read" else ""
+            code = int.from_bytes(answer[4:], "little")
+            return f" ! {code:08X}"
+        if verb == "read":
+            return f" = {found.hex().upper()}"
+        return ""
 
 
 def changed_eds(changes: Mapping[str, Mapping[str, str]]) -> str:
-    """The shipped EDS with other keys in some sections; a key with an empty text goes, a section without keys too."""
+    """Return the shipped EDS with other keys in some sections.
+
+    A key with an empty text is removed. A section for which no keys are given is removed.
+    """
     text = shipped_eds()
     for section, keys in changes.items():
         found = re.search(
@@ -173,29 +227,52 @@ def changed_eds(changes: Mapping[str, Mapping[str, str]]) -> str:
 
 
 def play(text: str) -> str:
-    """The scenario with what is sent now in place of what was."""
+    """Return the scenario with the current output in place of the old output."""
     header, lines = split(text)
     tables: dict[str, Any] = tomllib.loads(header)
     golden = tables.pop("golden", {})
-    with TemporaryDirectory() as folder:
-        if "eds" in golden:
-            (Path(folder) / "changed.eds").write_bytes(changed_eds(golden["eds"]).encode("latin-1"))
-            tables["canopen"]["eds"] = f"{folder}/changed.eds"
-        player = Player(Drive(tables, INPUTS / "scenario.toml"))
-    player.out = header.splitlines() + [
-        f"; warning: {warning}" for warning in player.drive.warnings
-    ]
+    player = _player(tables, golden)
+    player.out = header.splitlines()
+    for warning in player.drive.warnings:
+        player.out.append(f"; warning: {warning}")
     if golden.get("start", True):
         for esc in range(len(tables["esc"])):
             player.drive.happen("port_opened", [str(esc + 1)], 0)
         player.input(0, "start", [])
         player.write_down()
-    comments = dict(line.split(";", 1) for line in lines if re.match(r"[\d.]+ ->.*;", line))
-    comments = {sent.strip(): comment for sent, comment in comments.items()}
+    _play_lines(player, lines)
+    comments = _comments_of_output(lines)
+    for number, line in enumerate(player.out):
+        if line in comments:
+            player.out[number] = f"{line}  ;{comments[line]}"
+    return "\n".join(player.out) + "\n"
+
+
+def _player(tables: dict[str, Any], golden: Mapping[str, Any]) -> Player:
+    with TemporaryDirectory() as folder:
+        if "eds" in golden:
+            eds = Path(folder) / "changed.eds"
+            eds.write_bytes(changed_eds(golden["eds"]).encode("latin-1"))
+            tables["canopen"]["eds"] = str(eds)
+        return Player(Drive(tables, INPUTS / "scenario.toml"))
+
+
+def _comments_of_output(lines: list[str]) -> dict[str, str]:
+    """Return the comments after sent frames, by the text of the frame's line."""
+    comments = {}
+    for line in lines:
+        if re.match(r"[\d.]+ ->.*;", line):
+            sent, comment = line.split(";", 1)
+            comments[sent.strip()] = comment
+    return comments
+
+
+def _play_lines(player: Player, lines: list[str]) -> None:
+    """Give the lines of input to the gateway, and write all lines with the current output."""
     held = False
     for line in lines:
-        body = line.partition(";")[0].strip()
-        if not body:
+        body, _, comment = line.partition(";")
+        if not body.strip():
             if not line.startswith("; warning: "):
                 player.out.append(line)
             continue
@@ -209,20 +286,23 @@ def play(text: str) -> str:
         held = verb == "held"
         if verb in ("read", "write"):
             for mark in ("=", "!"):
-                words = words[: words.index(mark)] if mark in words else words
-        found = player.input(at, verb, words)
+                if mark in words:
+                    words = words[: words.index(mark)]
+        result = player.input(at, verb, words)
         given = line
         if verb in ("read", "write"):
-            comment = line.partition(";")[2]
-            given = " ".join((time, verb, *words)) + found + (f"  ;{comment}" if comment else "")
+            given = " ".join((time, verb, *words)) + result
+            if comment:
+                given += f"  ;{comment}"
         player.out.append(given)
         player.write_down()
-    player.out = [f"{line}  ;{comments[line]}" if line in comments else line for line in player.out]
-    return "\n".join(player.out) + "\n"
 
 
 def replay(capture: Path) -> str:
-    """What a capture's gateway received and sent; times from the first frame on."""
+    """Return the frames that a capture's gateway received and sent, as lines of a scenario.
+
+    Times count from the first frame.
+    """
     return "\n".join(_replay(capture)) + "\n"
 
 
@@ -232,4 +312,5 @@ def _replay(capture: Path) -> Iterator[str]:
         if start is None:
             start = time
             yield f"; capture {capture.name}, time 0 is {time} ns of its clock"
-        yield f"{seconds(time - start)} {'<-' if received else '->'} {frame_text(item)}"
+        arrow = "<-" if received else "->"
+        yield f"{seconds(time - start)} {arrow} {frame_text(item)}"

@@ -1,4 +1,7 @@
-"""The golden set: what 0.5.0 made of its inputs, and what is made of them now. `make golden` records it anew; see README.md."""
+"""The golden set: the recorded behaviour of the gateway is compared with its current behaviour.
+
+`make golden` records the set again. See README.md.
+"""
 
 import re
 from pathlib import Path
@@ -10,10 +13,12 @@ import record
 HERE = record.HERE
 
 
-FRAMES = [
-    file for file in record.files() if file.parent.name != "commands" or file.stem == "convert"
-]
-"""Those that a core makes."""
+def _is_made_by_a_core(file: Path) -> bool:
+    return file.parent.name != "commands" or file.stem == "convert"
+
+
+FRAMES = [file for file in record.files() if _is_made_by_a_core(file)]
+"""The files whose content is computed by a core."""
 
 
 def named(file: Path) -> str:
@@ -21,24 +26,23 @@ def named(file: Path) -> str:
 
 
 @pytest.mark.parametrize("file", FRAMES, ids=named)
-def test_no_frame_has_changed(file: Path) -> None:
+def test_frames_have_not_changed(file: Path) -> None:
     unchanged(file)
 
 
 @pytest.mark.parametrize("file", [f for f in record.files() if f not in FRAMES], ids=named)
-def test_no_word_has_changed(file: Path) -> None:
+def test_texts_have_not_changed(file: Path) -> None:
     unchanged(file)
 
 
 def unchanged(file: Path) -> None:
     found = record.changes(file, record.made(file))
-    assert not found, "\n".join(
-        [*found, "If this is meant: make golden, and commit what it says with the change."]
-    )
+    advice = "If this is meant: make golden, and commit what it says with the change."
+    assert not found, "\n".join([*found, advice])
 
 
 @pytest.mark.parametrize("file", judge.files(), ids=named)
-def test_what_is_golden_is_right(file: Path) -> None:
+def test_recorded_values_are_right(file: Path) -> None:
     found = judge.judge(file)
     assert found.count.total() > 0
     assert found.wrong == []
@@ -52,7 +56,7 @@ def test_what_is_golden_is_right(file: Path) -> None:
         ("dialogues/sync_of_three.txt", "-> 382#581F", "-> 382#591F"),
     ],
 )
-def test_the_judge_sees_what_is_wrong(tmp_path: Path, name: str, old: str, new: str) -> None:
+def test_the_judge_finds_a_wrong_frame(tmp_path: Path, name: str, old: str, new: str) -> None:
     file = tmp_path / name
     file.parent.mkdir()
     text = (HERE / name).read_text(encoding="utf-8")
@@ -61,8 +65,10 @@ def test_the_judge_sees_what_is_wrong(tmp_path: Path, name: str, old: str, new: 
     assert judge.judge(file).wrong
 
 
-def test_only_the_adapter_knows_the_product() -> None:
-    knowing = re.compile(r"^\s*(from|import) kontronik_can_gw", re.MULTILINE)
-    assert [
-        file.name for file in HERE.glob("*.py") if knowing.search(file.read_text(encoding="utf-8"))
-    ] == ["drive.py"]
+def test_only_the_adapter_imports_the_product() -> None:
+    imports = re.compile(r"^\s*(from|import) kontronik_can_gw", re.MULTILINE)
+    found = []
+    for file in HERE.glob("*.py"):
+        if imports.search(file.read_text(encoding="utf-8")):
+            found.append(file.name)
+    assert found == ["drive.py"]
