@@ -1,4 +1,4 @@
-"""A DBC as people write it: compiled, refused, and what its messages hold."""
+"""Compile a DBC as users write it, expect its refusal, and read the data of its messages."""
 
 import re
 from collections.abc import Sequence
@@ -22,10 +22,12 @@ from kontronik_can_gw.times import MS
 
 
 def check_comments(database: Database) -> None:
-    """Everything has a sentence as comment, without what a parser may take for syntax."""
+    """Assert that each comment is a sentence without text that a parser may take for syntax."""
     owners: list[Any] = [database.buses[0], *database.nodes, *database.messages]
-    owners += [signal for message in database.messages for signal in message.signals]
-    for text in (str(owner.comment) for owner in owners):
+    for message in database.messages:
+        owners += message.signals
+    for owner in owners:
+        text = str(owner.comment)
         assert len(text) >= 10 and text.endswith("."), text
         assert not re.search(r"[;\\]|\b[A-Z]+_\B", text), text
 
@@ -35,14 +37,14 @@ FILE = "my_car.dbc"
 
 
 def compiled(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> Layout:
-    """The layout of a DBC for ESCs of these names. ``settings``: fields of DbcConfig."""
+    """Return the layout of a DBC for ESCs of these names. ``settings`` are fields of DbcConfig."""
     escs = [EscSettings(name, 7) for name in names]
     database = parse_database(text.encode(), FILE)
     return prepare(database, FILE, escs, DbcConfig(**settings), fd_allowed=True)
 
 
 def refused(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> list[str]:
-    """What ``compiled`` refuses these with: plain lines, each with its place."""
+    """Return the lines with which ``compiled`` refuses a DBC. Each line begins with its place."""
     with pytest.raises(UserError) as caught:
         compiled(text, names, **settings)
     assert caught.value.exit_code == 2
@@ -55,7 +57,10 @@ def refused(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> lis
 
 
 def gateway_with(layout: Layout, *lives: LiveData) -> Gateway:
-    """A gateway whose ESCs, called esc1 and so on, have just sent this; without: one that is not heard."""
+    """Return a gateway whose ESCs (esc1, esc2 ...) have just sent this data.
+
+    Without data the gateway has one ESC, which has sent nothing.
+    """
     names = [f"esc{number}" for number in range(1, max(1, len(lives)) + 1)]
     gateway = Gateway([EscSettings(name, 7) for name in names], layout, 0)
     for esc, live in enumerate(lives):
@@ -64,6 +69,7 @@ def gateway_with(layout: Layout, *lives: LiveData) -> Gateway:
 
 
 def packed(plan: MessagePlan, gateway: Gateway, page: int | None = None) -> bytes:
-    """What a message holds now."""
-    bits = compile_pack(plan)(gateway.escs, gateway.status, NOW, 0, plan.pages.index(page))
+    """Return the current data of a message."""
+    pack = compile_pack(plan)
+    bits = pack(gateway.escs, gateway.status, NOW, 0, plan.pages.index(page))
     return bits.to_bytes(plan.length, "little")

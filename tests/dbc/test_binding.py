@@ -1,4 +1,7 @@
-"""What a signal is bound to: by its name, by ``[dbc.bind]``, as a constant, alive counter or CRC; and how enumerations map."""
+"""The value that a signal carries: by its name, by ``[dbc.bind]``, a constant, a counter or a CRC.
+
+Enumerations and their codes are tested here too.
+"""
 
 import math
 import struct
@@ -40,24 +43,27 @@ def layout_of(messages: Sequence[Msg], names: Sequence[str] = ("esc1",), **more:
 
 
 def raw_of(signal: Sig, bind: str | float | None = None, live: LiveData = LIVE) -> int:
-    """The raw value that a lone signal carries."""
+    """Return the raw value of a signal that is alone in its message."""
     message = Msg("M", 0x100, 20, [replace(signal, start=8)])
-    layout = layout_of([message], bind={} if bind is None else {"M." + signal.name: bind})
+    bindings = {} if bind is None else {f"M.{signal.name}": bind}
+    layout = layout_of([message], bind=bindings)
     data = packed(layout.messages[0], gateway_with(layout, live))
     return get(data, 8, signal.length, True, signal.signed)
 
 
 def float_of(signal: Sig, bind: float | None = None, live: LiveData = LIVE) -> float:
-    """The number that a lone float carries, without factor and offset."""
-    raw = raw_of(replace(signal, signed=True, is_float=True), bind, live) % (1 << signal.length)
-    code = "<f" if signal.length == 32 else "<d"
-    return float(struct.unpack(code, raw.to_bytes(signal.length // 8, "little"))[0])
+    """Return the number in a float that is alone in its message, without factor and offset."""
+    as_float = replace(signal, signed=True, is_float=True)
+    raw = raw_of(as_float, bind, live) % (1 << signal.length)
+    data = raw.to_bytes(signal.length // 8, "little")
+    (number,) = struct.unpack("<f" if signal.length == 32 else "<d", data)
+    return float(number)
 
 
-# --- names --------------------------------------------------------------------------------------------------------------
+# --- names
 
 
-def test_of_two_prefixes_the_longer_wins_and_a_source_before_a_prefix() -> None:
+def test_a_longer_prefix_wins_over_a_shorter_one_and_a_source_over_a_prefix() -> None:
     binder = Binder([EscSettings("left"), EscSettings("left_rear"), EscSettings("l")], {})
     found = binder.by_name("LeftRearBatteryVoltage")
     assert found is not None and found[1] == 1
@@ -65,26 +71,38 @@ def test_of_two_prefixes_the_longer_wins_and_a_source_before_a_prefix() -> None:
     assert found is not None and found[0].name == "max_battery_voltage"
 
 
-# --- [dbc.bind] ---------------------------------------------------------------------------------------------------------
+# --- [dbc.bind]
 
 
-def test_a_binding_overrides_the_name_and_one_of_message_and_signal_that_of_the_signal() -> None:
-    assert raw_of(Sig("Throttle", 0, 16, unit="V", factor="0.01"), "battery_voltage") == 4442
-    messages = [Msg(name, n, 8, [Sig("U", 0, 16)]) for n, name in enumerate(("A", "B"), 1)]
+def test_a_binding_overrides_the_name_of_the_signal() -> None:
+    throttle = Sig("Throttle", 0, 16, unit="V", factor="0.01")
+    assert raw_of(throttle, "battery_voltage") == 4442
+
+
+def test_a_binding_with_the_message_overrides_one_of_the_signal_alone() -> None:
+    voltage = Sig("U", 0, 16)
+    messages = [Msg("A", 1, 8, [voltage]), Msg("B", 2, 8, [voltage])]
     bind = {"U": "battery_voltage", "B.U": "operating_state_raw"}
-    sources = [plan.signals[0].source for plan in layout_of(messages, bind=bind).messages]
-    assert [s.name for s in sources if s] == ["battery_voltage", "operating_state_raw"]
+    plans = layout_of(messages, bind=bind).messages
+    sources = [plan.signals[0].source for plan in plans]
+    names = [source.name for source in sources if source]
+    assert names == ["battery_voltage", "operating_state_raw"]
 
 
-def test_bindings_of_a_one_esc_layout_go_to_every_esc() -> None:
+def test_bindings_of_a_one_esc_layout_apply_to_every_esc() -> None:
     voltage = Sig("U", 0, 16, unit="V", factor="0.01")
-    message = Msg("Power", 0x100, 8, [voltage, Sig("Id", 16, 8), Sig("Up", 24, 32, unit="s")])
+    constant = Sig("Id", 16, 8)
+    uptime = Sig("Up", 24, 32, unit="s")
+    message = Msg("Power", 0x100, 8, [voltage, constant, uptime])
     for key in ("U", "Power.U"):
         bind = {key: "battery_voltage", "Id": 7, "Up": "uptime"}
         layout = layout_of([message], ("esc1", "esc2"), bind=bind)
         gateway = gateway_with(layout, LIVE, LIVE._replace(battery_voltage=1))
-        frames = [(plan.can_id, packed(plan, gateway)[:3]) for plan in layout.messages]
-        assert frames == [(0x100, struct.pack("<HB", 4442, 7)), (0x101, struct.pack("<HB", 1, 7))]
+        frames = {plan.can_id: packed(plan, gateway)[:3] for plan in layout.messages}
+        assert frames == {
+            0x100: struct.pack("<HB", 4442, 7),
+            0x101: struct.pack("<HB", 1, 7),
+        }
 
 
 @pytest.mark.parametrize(
@@ -109,37 +127,53 @@ def test_a_constant_in_a_float_is_sent_as_a_float(length: int) -> None:
     assert float_of(Sig("X", 0, length, factor="0.5"), -3) == -6.0
 
 
-# --- codes --------------------------------------------------------------------------------------------------------------
+# --- codes
 
 
-def test_an_enumeration_in_a_float_keeps_its_table_and_beyond_limits_it_is_nan() -> None:
+def test_an_enumeration_in_a_float_is_sent_by_its_value_table_or_as_nan() -> None:
     state = Sig("OperatingState", 0, 32, texts={5: "Forward"})
     assert float_of(state) == 5.0
-    assert math.isnan(float_of(state, live=LIVE._replace(operating_state=1)))
-    for maximum, sent in (("1", False), ("44.4", False), ("44.5", True), ("0", True)):
-        number = float_of(Sig("BatteryVoltage", 0, 32, unit="V", maximum=maximum))
-        assert number == pytest.approx(44.42) if sent else math.isnan(number)
+    other = LIVE._replace(operating_state=1)
+    assert math.isnan(float_of(state, live=other))
 
 
-def test_the_codes_are_known_by_their_usual_names() -> None:
-    for text in ("NotAvailable", "SNA", "sna", "N_A", "SignalNotAvailable", "not_available"):
-        assert raw_of(Sig("MaxBatteryVoltage", 0, 8, texts={9: text})) == 9  # no info yet
-    for text in ("Error", "ERR", "Invalid"):
-        assert raw_of(Sig("BatteryVoltage", 0, 8, unit="mV", texts={9: text})) == 9
+@pytest.mark.parametrize(
+    ("maximum", "is_sent"), [("1", False), ("44.4", False), ("44.5", True), ("0", True)]
+)
+def test_a_float_beyond_its_limits_is_nan(maximum: str, is_sent: bool) -> None:
+    number = float_of(Sig("BatteryVoltage", 0, 32, unit="V", maximum=maximum))
+    if is_sent:
+        assert number == pytest.approx(44.42)
+    else:
+        assert math.isnan(number)
 
 
-# --- alive counter and E2E profile 1 ------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    "text", ["NotAvailable", "SNA", "sna", "N_A", "SignalNotAvailable", "not_available"]
+)
+def test_the_code_for_not_available_is_found_by_its_usual_names(text: str) -> None:
+    signal = Sig("MaxBatteryVoltage", 0, 8, texts={9: text})  # an info value, not yet received
+    assert raw_of(signal) == 9
+
+
+@pytest.mark.parametrize("text", ["Error", "ERR", "Invalid"])
+def test_the_code_for_an_error_is_found_by_its_usual_names(text: str) -> None:
+    signal = Sig("BatteryVoltage", 0, 8, unit="mV", texts={9: text})
+    assert raw_of(signal) == 9
+
+
+# --- alive counter and E2E profile 1
 
 
 def theirs(data: bytes, at: int, data_id: int) -> bytes:
-    """The frame as the autosar-e2e package protects it, the counter left as it is."""
+    """Return the frame as the autosar-e2e package protects it, with an unchanged counter."""
     buffer = bytearray(data)
     p01.e2e_p01_protect(buffer, data_id, offset=at, increment_counter=False)
     return bytes(buffer)
 
 
 @given(st.binary(min_size=2, max_size=64), st.integers(0, 0xFFFF), st.data())
-def test_the_crc_is_that_of_the_autosar_package_at_every_place(
+def test_the_crc_equals_the_one_of_the_autosar_package_at_every_place(
     data: bytes, data_id: int, draw: st.DataObject
 ) -> None:
     at = draw.draw(st.integers(0, len(data) - 2))
@@ -153,7 +187,8 @@ def test_the_crc_is_that_of_the_autosar_package_at_every_place(
 def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
     at: int, length: int, data_ids: dict[str, int]
 ) -> None:
-    counter_at, value_at = (at + 1) % 8 * 8, 16 * ((at // 2 + 2) % 4)
+    counter_at = 8 * ((at + 1) % 8)
+    value_at = 16 * ((at // 2 + 2) % 4)
     signals = [
         Sig("Crc8", at * 8, 8),
         Sig("Alive", counter_at, length),
@@ -165,15 +200,15 @@ def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
     gateway.start(0)
     frames = gateway.take_frames(0)
     for n in range(40):
-        now = (50 + n * 10 + 600 * (n // 20)) * MS  # with a loss amid them
+        loss = 600 * (n // 20)  # between the first 20 frames and the others
+        now = (50 + 10 * n + loss) * MS
         gateway.advance(now)
         frames += gateway.take_frames(now)
         wire = encode(LIVE._replace(battery_voltage=n * 100), WireLayout.V4)
         gateway.receive_bytes(0, wire, now, now)
         frames += gateway.take_frames(now)
-    assert [get(frame.data, counter_at, length, True) for frame in frames] == [
-        n % 15 for n in range(42)
-    ]
+    counters = [get(frame.data, counter_at, length, True) for frame in frames]
+    assert counters == [n % 15 for n in range(42)]
     for frame in frames:
         # the package needs a byte after the CRC
         moved = frame.data[at : at + 1] + frame.data[:at] + frame.data[at + 1 :]

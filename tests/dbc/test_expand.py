@@ -1,4 +1,7 @@
-"""The DBC of several ESCs from that of one, and of a configuration: loss-free, by the rules, and exactly what is sent."""
+"""The DBC for several ESCs is made from the DBC of one ESC and from a configuration.
+
+Nothing is lost, names and ids follow the rules, and the file describes exactly the frames sent.
+"""
 
 import random
 from collections.abc import Mapping, Sequence
@@ -30,26 +33,29 @@ def escs(*names: str) -> list[EscSettings]:
     return [EscSettings(name) for name in names]
 
 
-ONE, PAIR = escs("esc1"), escs("left", "right")
+ONE = escs("esc1")
+PAIR = escs("left", "right")
 
 
 def multiplied(
     text: str, escs: Sequence[EscSettings], node: str = "Gateway", **more: Any
 ) -> tuple[Database, str]:
+    """Return the DBC for these ESCs, as a database and as text."""
     plain = read(text)
-    copies = expand.copies_of(plain, "my.dbc", escs, DbcConfig(node=node, **more))
+    settings = DbcConfig(node=node, **more)
+    copies = expand.copies_of(plain, "my.dbc", escs, settings)
     out = writer.copies_text(plain, copies)
     return read(out), out
 
 
-# --- everything cantools can hold, as plain data ------------------------------------------------------------------------
+# --- everything that a database of cantools contains, as plain data
 
 MADE = {"_codecs", "_signal_tree", "_signal_dict", "_relation_attributes"}
-"""What cantools makes of the rest, and what ``relations`` shows."""
+"""Attributes that cantools derives from the others, and those that ``relations`` compares."""
 
 
 def facts(thing: Any, prefix: str = "") -> Any:
-    """All of a thing, names without a prefix."""
+    """Return all attributes of an object as plain data. The prefix is removed from names."""
     if isinstance(thing, str):
         return thing.removeprefix(prefix)
     if isinstance(thing, Mapping):
@@ -62,9 +68,10 @@ def facts(thing: Any, prefix: str = "") -> Any:
 
 
 def facts_of_message(message: Message, prefix: str = "") -> Any:
-    """All but name and id."""
+    """Return all attributes of a message except its name and its id."""
     names = [signal.name for signal in message.signals]
-    names += [name for group in message.signal_groups or [] for name in group.signal_names]
+    for group in message.signal_groups or []:
+        names += group.signal_names
     assert all(name.startswith(prefix) for name in names)
     found = facts(message, prefix)
     found["_signals"].sort(key=lambda signal: (signal["start"], signal["name"]))
@@ -72,7 +79,9 @@ def facts_of_message(message: Message, prefix: str = "") -> Any:
 
 
 def all_facts(database: Database) -> tuple[Any, ...]:
-    messages = [(m.name, m.frame_id, facts_of_message(m)) for m in database.messages]
+    messages = []
+    for message in database.messages:
+        messages.append((message.name, message.frame_id, facts_of_message(message)))
     return facts_of_database(database), messages
 
 
@@ -84,7 +93,7 @@ def relations(text: str) -> list[str]:
     return sorted(line for line in text.splitlines() if line.startswith("BA_REL_"))
 
 
-# --- nothing is lost ----------------------------------------------------------------------------------------------------
+# --- nothing is lost
 
 
 def test_the_shipped_file_for_one_esc_is_written_byte_for_byte() -> None:
@@ -95,11 +104,15 @@ def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
     before = read(RICH)
     after, text = multiplied(RICH, PAIR, "Gw")
     assert facts_of_database(after) == facts_of_database(before)
-    copies = {f"{p}{stem}": (p, old) for p in ("Left", "Right") for stem, old in (("Power", "EscPower"), ("Flow", "Flow"))}  # fmt: skip
-    copies |= {name: ("", name) for name in ("GatewayHealth", "Foreign")}
-    assert [m.name for m in after.messages] == [
-        "LeftPower", "RightPower", "LeftFlow", "RightFlow", "GatewayHealth", "Foreign",
-    ]  # fmt: skip
+    copies = {
+        "LeftPower": ("Left", "EscPower"),
+        "RightPower": ("Right", "EscPower"),
+        "LeftFlow": ("Left", "Flow"),
+        "RightFlow": ("Right", "Flow"),
+        "GatewayHealth": ("", "GatewayHealth"),
+        "Foreign": ("", "Foreign"),
+    }
+    assert [message.name for message in after.messages] == list(copies)
     for message in after.messages:
         prefix, old = copies[message.name]
         original = before.get_message_by_name(old)
@@ -119,23 +132,35 @@ def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.text(st.sampled_from('aB1 \n";:,_()[]|é.'), max_size=40))
-def test_any_comment_and_any_text_come_through(words: str) -> None:
+def test_any_comment_and_any_text_are_kept(words: str) -> None:
     escaped = words.replace('"', '\\"')
-    text = dbc_text(
-        [Msg("X", 5, 8, [Sig("BatteryVoltage", 0, 16, unit="V")])],
-        f'CM_ "{escaped}";\nCM_ BO_ 5 "{escaped}";\nCM_ SG_ 5 BatteryVoltage "{escaped}";\n'
-        f'BA_DEF_ "T" STRING ;\nBA_DEF_DEF_ "T" "";\nBA_ "T" "{escaped}";',
+    message = Msg("X", 5, 8, [Sig("BatteryVoltage", 0, 16, unit="V")])
+    entries = (
+        f'CM_ "{escaped}";\n'
+        f'CM_ BO_ 5 "{escaped}";\n'
+        f'CM_ SG_ 5 BatteryVoltage "{escaped}";\n'
+        'BA_DEF_ "T" STRING ;\n'
+        'BA_DEF_DEF_ "T" "";\n'
+        f'BA_ "T" "{escaped}";'
     )
-    assert all_facts(multiplied(text, ONE)[0]) == all_facts(read(text))
+    text = dbc_text([message], entries)
+    after, _ = multiplied(text, ONE)
+    assert all_facts(after) == all_facts(read(text))
 
 
-# --- names and ids ------------------------------------------------------------------------------------------------------
+# --- names and ids
 
 
 def simple(*ids: int, extended: bool = False, gateway: tuple[int, ...] = ()) -> str:
-    volts, uptime = Sig("BatteryVoltage", 0, 16, unit="V"), Sig("Uptime", 0, 32, unit="s")
-    messages = [Msg(f"EscM{n}", i, 8, [volts], extended) for n, i in enumerate(ids)]
-    return dbc_text([*messages, *(Msg(f"Gw{n}", i, 8, [uptime]) for n, i in enumerate(gateway))])
+    """Return a DBC with ESC messages of these ids, and gateway messages of other ids."""
+    volts = Sig("BatteryVoltage", 0, 16, unit="V")
+    uptime = Sig("Uptime", 0, 32, unit="s")
+    messages = []
+    for number, can_id in enumerate(ids):
+        messages.append(Msg(f"EscM{number}", can_id, 8, [volts], extended))
+    for number, can_id in enumerate(gateway):
+        messages.append(Msg(f"Gw{number}", can_id, 8, [uptime]))
+    return dbc_text(messages)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +169,8 @@ def simple(*ids: int, extended: bool = False, gateway: tuple[int, ...] = ()) -> 
         (simple(0x100, 0x108), None, None, [0x100, 0x101, 0x108, 0x109]),
         (simple(0x100, 0x101, 0x102), None, None, [0x100, 0x103, 0x101, 0x104, 0x102, 0x105]),
         (simple(0x100, 0x101, gateway=(0x102,)), None, None, [0x100, 0x103, 0x101, 0x104, 0x102]),
-        (simple(0x100, gateway=(0x101, 0x102, 0x103)), None, None, [0x100, 0x104, 0x101, 0x102, 0x103]),
+        (simple(0x100, gateway=(0x101, 0x102, 0x103)), None, None,
+         [0x100, 0x104, 0x101, 0x102, 0x103]),
         (simple(0x100, gateway=(0x110,)), 0x200, None, [0x200, 0x201, 0x210]),
         (simple(0x110, gateway=(0x100,)), 0x000, None, [0x010, 0x011, 0x000]),
         (simple(0x100, 0x101), None, 0x20, [0x100, 0x120, 0x101, 0x121]),
@@ -182,26 +208,30 @@ def test_names_of_more_than_32_characters_are_refused() -> None:
     (line,) = refused(text, ("abcdefg", "b", "ghijklm"), node="Gateway")
     assert "longer than 32 characters" in line
     assert "AbcdefgLimitBatteryVoltageMinimum, GhijklmLimitBatteryVoltageMinimum." in line
-    # what stands in the file with a longer name is left as it is
+    # longer names that the user's file already has are not changed
     long = text.replace("EscM", "M" * 40)
-    assert multiplied(long, ONE, base_id=0x100)[0].messages[0].name == "M" * 40
+    after, _ = multiplied(long, ONE, base_id=0x100)
+    assert after.messages[0].name == "M" * 40
     theirs = text + f"BO_ 9 {'T' * 40}: 8 Other\n"
-    assert multiplied(theirs, escs("a", "b"))[0].messages[-1].name == "T" * 40
+    after, _ = multiplied(theirs, escs("a", "b"))
+    assert after.messages[-1].name == "T" * 40
 
 
-# --- what is written is what is sent ------------------------------------------------------------------------------------
+# --- the written file describes the frames that are sent
 
 
 def plain_plans(layout: Layout) -> list[MessagePlan]:
-    """With the signals in one order: that of the file is sorted by the writer."""
-    return [
-        replace(plan, compiled=tuple(sorted(plan.signals, key=lambda signal: signal.name)))
-        for plan in layout.messages
-    ]
+    """Return the plans with their signals sorted by name, because the writer sorts them."""
+    plans = []
+    for plan in layout.messages:
+        ordered = sorted(plan.signals, key=lambda signal: signal.name)
+        plans.append(replace(plan, compiled=tuple(ordered)))
+    return plans
 
 
 def test_limits_of_64_bits_are_written_exactly() -> None:
-    signal = writer.SignalRow("Big", 0, 64, limits=(Fraction(-1, 8), Fraction(2**64 - 2)))
+    limits = (Fraction(-1, 8), Fraction(2**64 - 2))
+    signal = writer.SignalRow("Big", 0, 64, limits=limits)
     row = writer.MessageRow(1, "M", 8, ["Gateway"], None, {}, [signal])
     assert "[-0.125|18446744073709551614]" in writer.dbc_text(read(SHIPPED), [row])
 
@@ -214,29 +244,34 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
     after = read(writer.copies_text(before))
     assert all_facts(after) == all_facts(before)
     bind = DbcConfig(bind=bindings(messages))
-    old, new = (prepare(database, "x", PAIR, bind, fd_allowed=True) for database in (before, after))
+    old = prepare(before, "x", PAIR, bind, fd_allowed=True)
+    new = prepare(after, "x", PAIR, bind, fd_allowed=True)
     assert plain_plans(new) == plain_plans(old)
 
 
 @pytest.mark.parametrize(("text", "node"), [(SHIPPED, "KontronikGateway"), (RICH, "Gw")])
-def test_what_is_sent_is_what_the_written_file_says(text: str, node: str) -> None:
-    """ESCs of which two are alike: what they share is the same as if each were compiled."""
+def test_the_written_file_compiles_to_the_plans_that_are_sent(text: str, node: str) -> None:
+    """Two of the ESCs are alike and share a plan. It equals the plan of each compiled alone."""
     three = [EscSettings("left", 7), EscSettings("mid", 14), EscSettings("right", 7)]
-    sent, again = (
-        prepare(database, "x", three, DbcConfig(node=node), fd_allowed=True)
-        for database in (read(text), multiplied(text, three, node)[0])
-    )
+    settings = DbcConfig(node=node)
+    written, _ = multiplied(text, three, node)
+    sent = prepare(read(text), "x", three, settings, fd_allowed=True)
+    again = prepare(written, "x", three, settings, fd_allowed=True)
     assert any(plan.renamed for plan in sent.messages)
     plain = [replace(plan, compiled=plan.signals, renamed=None) for plan in sent.messages]
     assert plain_plans(replace(sent, messages=tuple(plain))) == plain_plans(again)
 
 
-def test_long_names_by_attribute_are_written_in_full_and_do_not_come_back_as_they_were() -> None:
+def test_long_names_by_attribute_are_written_in_full_and_not_as_attributes() -> None:
     more = (
-        'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\nBA_DEF_DEF_ "SystemSignalLongSymbol" "";\n'
+        'BA_DEF_ SG_ "SystemSignalLongSymbol" STRING ;\n'
+        'BA_DEF_DEF_ "SystemSignalLongSymbol" "";\n'
         'BA_ "SystemSignalLongSymbol" SG_ 5 U "BatteryVoltage";'
     )
-    after, text = multiplied(dbc_text([Msg("EscX", 5, 8, [Sig("U", 0, 16, unit="V")])], more), PAIR)
-    names = [signal.name for message in after.messages for signal in message.signals]
+    message = Msg("EscX", 5, 8, [Sig("U", 0, 16, unit="V")])
+    after, text = multiplied(dbc_text([message], more), PAIR)
+    names = []
+    for copy in after.messages:
+        names += [signal.name for signal in copy.signals]
     assert names == ["LeftBatteryVoltage", "RightBatteryVoltage"]
     assert 'BA_ "SystemSignalLongSymbol"' not in text

@@ -1,4 +1,4 @@
-"""When frames go out and what stands in them, with time passed in."""
+"""The times at which frames are sent and the values in them, with a clock set by the tests."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,7 +31,7 @@ def volts(number: int) -> LiveData:
 
 
 class Bench:
-    """A gateway whose time is turned by hand. Every frame is kept with the time at which it was handed out."""
+    """A gateway whose clock is set by the test. All frames are kept with their times of sending."""
 
     def __init__(
         self,
@@ -40,13 +40,17 @@ class Bench:
         silent: bool = False,
         start: bool = False,
     ) -> None:
-        more = "\n".join(
-            f'BA_ "GenMsgSendType" BO_ {m.dbc_id} {kind};\nBA_ "GenMsgCycleTime" BO_ {m.dbc_id} {cycle};\n'
-            f'BA_ "GenMsgDelayTime" BO_ {m.dbc_id} {delay};'
-            for m, kind, cycle, delay in messages
-        )
-        layout = compiled(dbc_text([m for m, *_ in messages], more), names)
-        self.gateway = Gateway([EscSettings(name, 7) for name in names], layout, 0, silent)
+        attributes = []
+        for message, kind, cycle, delay in messages:
+            attributes += [
+                f'BA_ "GenMsgSendType" BO_ {message.dbc_id} {kind};',
+                f'BA_ "GenMsgCycleTime" BO_ {message.dbc_id} {cycle};',
+                f'BA_ "GenMsgDelayTime" BO_ {message.dbc_id} {delay};',
+            ]
+        text = dbc_text([message for message, *_ in messages], "\n".join(attributes))
+        layout = compiled(text, names)
+        escs = [EscSettings(name, 7) for name in names]
+        self.gateway = Gateway(escs, layout, 0, silent)
         self.now = 0
         self.sent: list[tuple[int, CanFrame]] = []
         if start:
@@ -54,51 +58,57 @@ class Bench:
             self.take()
 
     def take(self) -> None:
-        self.sent += [(self.now, frame) for frame in self.gateway.take_frames(self.now)]
+        for frame in self.gateway.take_frames(self.now):
+            self.sent.append((self.now, frame))
 
     def until(self, when: int) -> None:
-        """Let time pass as a perfect runtime does: awake at each deadline."""
-        while (deadline := self.gateway.next_deadline()) <= when:
+        """Let time pass as a perfect runtime does, which calls the gateway at each deadline."""
+        deadline = self.gateway.next_deadline()
+        while deadline <= when:
             self.now = max(self.now, deadline)
             self.gateway.advance(self.now)
             self.take()
+            deadline = self.gateway.next_deadline()
         self.now = when
 
     def jump(self, when: int) -> None:
-        """Be late: one call only."""
+        """Let time pass as a late runtime does, which calls the gateway only at the end."""
         self.now = when
         self.gateway.advance(when)
         self.take()
 
     def live(self, *data: LiveData | InfoData, esc: int = 0) -> None:
-        """What comes in one read."""
-        wire = b"".join(encode(each, WireLayout.V4) for each in data or (LIVE,))
-        self.gateway.receive_bytes(esc, wire, self.now, self.now)
+        """Receive frames in one read. Without data: ``LIVE``."""
+        frames = [encode(each, WireLayout.V4) for each in data or (LIVE,)]
+        self.gateway.receive_bytes(esc, b"".join(frames), self.now, self.now)
         self.take()
 
     def feed(self, until: int, period: int = 10 * MS, data: LiveData = LIVE) -> None:
-        """Live frames of the first ESC at a steady pace."""
+        """Receive live frames of the first ESC at regular intervals."""
         while self.now + period <= until:
             self.until(self.now + period)
             self.live(data)
 
     def times(self, can_id: int = 0x100) -> list[int]:
+        """Return the times of sending of a message, in ms."""
         return [when // MS for when, frame in self.sent if frame.can_id == can_id]
 
     def raws(self, length: int = 16, start: int = 0, can_id: int = 0x100) -> list[int]:
-        return [
-            get(frame.data, start, length, True) for _, frame in self.sent if frame.can_id == can_id
-        ]
+        """Return the raw values of a signal in all frames of a message."""
+        frames = [frame for _, frame in self.sent if frame.can_id == can_id]
+        return [get(frame.data, start, length, True) for frame in frames]
 
     def forget(self) -> None:
         self.sent.clear()
 
 
 def lone(kind: int, cycle: int = 0, delay: int = 0, *more: Sig) -> Bench:
-    return Bench([(Msg("EscPower", 0x100, 8, [VOLTAGE, *more]), kind, cycle, delay)])
+    """Return the bench of a gateway with one message."""
+    message = Msg("EscPower", 0x100, 8, [VOLTAGE, *more])
+    return Bench([(message, kind, cycle, delay)])
 
 
-# --- scenes: what happens at which ms, and when frames go with which voltage -----------------------------------------------------
+# --- scenes: events with their times in ms, and the times and voltages of the frames sent
 
 
 def every(first: int, last: int, step: int, number: int) -> str:
@@ -108,39 +118,53 @@ def every(first: int, last: int, step: int, number: int) -> str:
 NONE = 65535
 SCENES: list[tuple[str, int, int, int, str, list[tuple[int, int]]]] = [
     ("a cyclic message is not sent on events", CYCLIC, 1000, 0, every(10, 500, 10, 7), [(0, NONE)]),
-    ("an event message goes with each live frame and no other", EVENT, 0, 0,
+    ("an event message is sent with each live frame and no other", EVENT, 0, 0,
      "10 live 1, 10 info, 20 live 2, 20 info, 30 live 3, 40", [(10, 1), (20, 2), (30, 3)]),
-    ("events closer than the minimum distance are put off and the newest value goes", EVENT, 0, 25,
+    ("events closer than the minimum distance are put off and send the newest value", EVENT, 0, 25,
      "3 live 1, 6 live 2, 9 live 3, 10 live 7, 100", [(3, 1), (28, 7)]),
-    ("one event makes one frame, also where another was put off before", EVENT, 0, 5,
-     "=10 live 1, 13 live 2, =16 live 3, 200", [(10, 1), (16, 3)]),  # the runtime reads the port before it looks at the clock
-    ("a cycle and an event that was put off make one frame", CYCLIC_AND_EVENT, 12, 5,
+    # the runtime reads the port before the clock
+    ("one event sends one frame even if another was put off before", EVENT, 0, 5,
+     "=10 live 1, 13 live 2, =16 live 3, 200", [(10, 1), (16, 3)]),
+    ("a cycle and an event that was put off send one frame", CYCLIC_AND_EVENT, 12, 5,
      "7 live 1, 9 live 2, 23", [(0, NONE), (7, 1), (12, 2)]),
-    ("a change that is taken back before it may go is not sent", ON_CHANGE, 0, 25,
+    ("a change that is undone while it is put off is not sent", ON_CHANGE, 0, 25,
      "10 live 1, 20 live 2, 30 live 1, 200", [(10, 1)]),
-    ("on change goes only when a raw value changes", ON_CHANGE, 0, 0,
-     "10 live 1, 20 live 1, 30 live 2, 40 live 2, 50 live 1, 60 live 1", [(10, 1), (30, 2), (50, 1)]),
-    ("of several frames in one read the newest goes", EVENT, 0, 0, "10 live 10 11 12, 20 live 20 21 22", [(10, 12), (20, 22)]),
-    ("a late call sends one frame and the grid stays", CYCLIC, 100, 0,
-     "0, =101 look, =101 look, =150 look, =1010 look, =1010 look, 1200", [(at, NONE) for at in (0, 101, 1010, 1100, 1200)]),
-    ("cyclic and event does both", CYCLIC_AND_EVENT, 100, 0,
+    ("an on-change message is sent only when a raw value changes", ON_CHANGE, 0, 0,
+     "10 live 1, 20 live 1, 30 live 2, 40 live 2, 50 live 1, 60 live 1",
+     [(10, 1), (30, 2), (50, 1)]),
+    ("the newest of several frames in one read is sent", EVENT, 0, 0,
+     "10 live 10 11 12, 20 live 20 21 22", [(10, 12), (20, 22)]),
+    ("a late call sends one frame and the grid of cycles does not move", CYCLIC, 100, 0,
+     "0, =101 look, =101 look, =150 look, =1010 look, =1010 look, 1200",
+     [(0, NONE), (101, NONE), (1010, NONE), (1100, NONE), (1200, NONE)]),
+    ("cyclic and event sends on both", CYCLIC_AND_EVENT, 100, 0,
      "50 live 1, 120 live 2, 210", [(0, NONE), (50, 1), (100, 1), (120, 2), (200, 2)]),
-    ("cyclic and on change does both", CYCLIC_AND_ON_CHANGE, 100, 10,
-     f"5 live 1, {every(15, 95, 10, 1)}, {every(105, 305, 10, 2)}", [(0, NONE), (10, 1), (100, 1), (110, 2), (200, 2), (300, 2)]),
+    ("cyclic and on change sends on both", CYCLIC_AND_ON_CHANGE, 100, 10,
+     f"5 live 1, {every(15, 95, 10, 1)}, {every(105, 305, 10, 2)}",
+     [(0, NONE), (10, 1), (100, 1), (110, 2), (200, 2), (300, 2)]),
     ("a cycle that the minimum distance puts off is not lost", CYCLIC_AND_ON_CHANGE, 100, 30,
      "90 live 1, 180, =190 live 2, 299", [(0, NONE), (90, 1), (120, 1), (190, 2), (220, 2)]),
-    ("on loss an event message goes once more", EVENT, 0, 100, "50 live 5, 55 live 6, 5000", [(50, 5), (150, 6), (305, NONE)]),
-    ("on loss a message sent on change goes once more", ON_CHANGE, 0, 0, "50 live 5, 60 live 5, 5000", [(50, 5), (310, NONE)]),
-    ("a lost port is a loss at once", EVENT, 0, 0, "10 live 1, 20 live 2, 23 lost, 2000", [(10, 1), (20, 2), (23, NONE)]),
+    ("a loss sends an event message once", EVENT, 0, 100,
+     "50 live 5, 55 live 6, 5000", [(50, 5), (150, 6), (305, NONE)]),
+    ("a loss sends an on-change message once", ON_CHANGE, 0, 0,
+     "50 live 5, 60 live 5, 5000", [(50, 5), (310, NONE)]),
+    ("a lost port is a loss at once", EVENT, 0, 0,
+     "10 live 1, 20 live 2, 23 lost, 2000", [(10, 1), (20, 2), (23, NONE)]),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("kind", "cycle", "delay", "steps", "sent"),
-    [pytest.param(*row[1:], id=row[0]) for row in SCENES],
+    [pytest.param(*row, id=title) for title, *row in SCENES],
 )
-def test_scene(kind: int, cycle: int, delay: int, steps: str, sent: list[tuple[int, int]]) -> None:
-    """``=`` in front of a time: nobody looks at the clock until then. Numbers are what one read brings."""
+def test_scene_sends_these_values_at_these_times(
+    kind: int, cycle: int, delay: int, steps: str, sent: list[tuple[int, int]]
+) -> None:
+    """Play a scene.
+
+    With ``=`` before a time, the gateway is not called until then. The numbers after ``live`` are
+    the voltages of the frames in one read.
+    """
     bench = lone(kind, cycle, delay, Sig("AliveCounter", 16, 4))
     for step in steps.split(", "):
         at, *what = step.split()
@@ -150,7 +174,8 @@ def test_scene(kind: int, cycle: int, delay: int, steps: str, sent: list[tuple[i
             bench.until(int(at) * MS)
         match what:
             case ["live", *numbers]:
-                bench.live(*(volts(int(number)) for number in numbers))
+                frames = [volts(int(number)) for number in numbers]
+                bench.live(*frames)
             case ["look"]:
                 bench.jump(bench.now)
             case ["info"]:
@@ -162,45 +187,45 @@ def test_scene(kind: int, cycle: int, delay: int, steps: str, sent: list[tuple[i
     assert bench.raws(4, 16) == [number % 16 for number in range(len(sent))]
 
 
-# --- one step -----------------------------------------------------------------------------------------------------------
+# --- one step
 
 
-def test_messages_of_one_step_go_in_the_order_in_which_they_became_due_then_of_their_index() -> (
-    None
-):
+def test_due_messages_are_sent_by_due_time_and_then_by_index() -> None:
     ids = {0x100: (EVENT, 0), 0x101: (CYCLIC, 20), 0x102: (EVENT, 0), 0x103: (CYCLIC, 50)}
-    messages = [
-        (Msg(f"EscPower{n}", n, 8, [VOLTAGE]), kind, cycle, 0) for n, (kind, cycle) in ids.items()
-    ]
+    messages = []
+    for can_id, (kind, cycle) in ids.items():
+        message = Msg(f"EscPower{can_id}", can_id, 8, [VOLTAGE])
+        messages.append((message, kind, cycle, 0))
     bench = Bench(messages)
     bench.until(0)
     bench.forget()
     bench.now = 60 * MS  # both cycles were missed
     bench.gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), bench.now, bench.now)
     bench.jump(bench.now)
-    # of the phases 0x101 was due at 20 ms, 0x103 at 25 ms
+    # because of its phase 0x101 was due at 20 ms, and 0x103 at 25 ms
     assert [frame.can_id for _, frame in bench.sent] == [0x101, 0x103, 0x100, 0x102]
 
 
-# --- cyclic -------------------------------------------------------------------------------------------------------------
+# --- cyclic
 
 
 @given(st.lists(st.sampled_from([0, 7 * MS, 10 * MS, 20 * MS, 100 * MS]), min_size=1, max_size=100))
 def test_phases_lie_within_the_cycle_and_evenly_apart(cycles: list[int]) -> None:
-    found = phases(cycles)
+    found = list(zip(cycles, phases(cycles), strict=True))
     for cycle in set(cycles) - {0}:
-        own = sorted(phase for phase, c in zip(found, cycles, strict=True) if c == cycle)
+        own = sorted(phase for other, phase in found if other == cycle)
         assert own[0] >= 0 and own[-1] < cycle
         assert len(set(own)) == len(own)
-        gaps = [b - a for a, b in pairwise([*own, own[0] + cycle])]
+        around = [*own, own[0] + cycle]
+        gaps = [after - before for before, after in pairwise(around)]
         assert max(gaps) - min(gaps) <= 1
 
 
-# --- event --------------------------------------------------------------------------------------------------------------
+# --- event
 
 
-def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too() -> None:
-    bench = Bench([(Msg("EscPower", 0x100, 8, [VOLTAGE, Sig("LinkState", 16, 8)]), EVENT, 0, 0)])
+def test_an_event_message_with_link_values_is_sent_with_each_live_frame() -> None:
+    bench = lone(EVENT, 0, 0, Sig("LinkState", 16, 8))
     lives = 0
     for _ in range(250):
         bench.until(bench.now + 10 * MS)
@@ -214,16 +239,22 @@ def test_live_frames_set_the_pace_of_an_event_message_that_holds_link_values_too
     assert len(bench.times()) == 1 + lives
 
 
-# --- loss and return ----------------------------------------------------------------------------------------------------
+# --- loss and return
 
 
-def test_silent_stops_every_message_with_values_and_the_link_status_goes_on() -> None:
+def test_silent_stops_messages_with_values_but_not_the_link_status() -> None:
     kinds = [(CYCLIC, 20), (EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 50)]
-    link = [Sig("LinkState", 0, 8), Sig("Losses", 8, 8), Sig("DataAge", 16, 16, unit="ms")]
+    link = [
+        Sig("LinkState", 0, 8),
+        Sig("Losses", 8, 8),
+        Sig("DataAge", 16, 16, unit="ms"),
+    ]
     messages = []
     for n, (kind, cycle) in enumerate(kinds):
-        messages += [(Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE]), kind, cycle, 0)]
-        messages += [(Msg(f"EscLink{n}", 0x200 + n, 8, link), kind, cycle, 0)]
+        values = Msg(f"EscM{n}", 0x100 + n, 8, [VOLTAGE])
+        status = Msg(f"EscLink{n}", 0x200 + n, 8, link)
+        messages.append((values, kind, cycle, 0))
+        messages.append((status, kind, cycle, 0))
     for silent in (False, True):
         bench = Bench(messages, silent=silent, start=True)
         bench.feed(500 * MS)
@@ -234,13 +265,17 @@ def test_silent_stops_every_message_with_values_and_the_link_status_goes_on() ->
         for n, (_, cycle) in enumerate(kinds):
             sent = [frame.data for _, frame in bench.sent if frame.can_id == 0x200 + n]
             assert (sent[-1][0], sent[-1][1]) == (4, 1)  # Lost, once
-            # without a cycle: on the loss, and then each second, for age and counters
-            assert len(sent) >= 2250 // cycle - 1 if cycle else len(sent) == 3
+            if cycle:
+                assert len(sent) >= 2250 // cycle - 1
+            else:
+                # on the loss, and then each second because of the age and the counters
+                assert len(sent) == 3
 
 
-def test_silent_lets_a_message_of_several_escs_go_on_as_long_as_one_is_up() -> None:
+def test_silent_sends_a_message_of_several_escs_while_one_is_up() -> None:
     signals = [Sig("LeftBatteryVoltage", 0, 16), Sig("RightBatteryVoltage", 16, 16)]
-    bench = Bench([(Msg("Both", 0x100, 8, signals), CYCLIC, 50, 0)], ("left", "right"), silent=True)
+    both = Msg("Both", 0x100, 8, signals)
+    bench = Bench([(both, CYCLIC, 50, 0)], ("left", "right"), silent=True)
     bench.live(esc=0)
     bench.feed(400 * MS)
     assert bench.raws(16, 16) == [65535] * 9
@@ -253,22 +288,24 @@ def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
         replace(VOLTAGE, name="LeftBatteryVoltage"),
         replace(VOLTAGE, name="RightBatteryVoltage", start=16),
     ]
-    bench = Bench([(Msg("Both", 0x100, 8, signals), EVENT, 0, 0)], ("left", "right"))
+    both = Msg("Both", 0x100, 8, signals)
+    bench = Bench([(both, EVENT, 0, 0)], ("left", "right"))
     bench.live(volts(1))
     bench.live(volts(2), esc=1)
     bench.now = 200 * MS
     bench.live(volts(3))
-    bench.now = 200 * MS + TIMEOUT - 1 * MS  # nobody has looked at the clock since
+    bench.now = 200 * MS + TIMEOUT - 1 * MS  # without a call of the gateway since then
     bench.forget()
     bench.live(volts(4))
     assert bench.raws(16, 0)[-1] == 4
     assert set(bench.raws(16, 16)) == {65535}
 
 
-# --- alive counter, pages ---------------------------------------------------------------------------------------------
+# --- alive counter, pages
 
 
 def paged(kind: int, cycle: int, delay: int = 0, start: bool = False) -> Bench:
+    """Return the bench of a gateway with a message of three pages."""
     signals = [
         Sig("Page", 0, 8, mux="M"),
         Sig("BatteryVoltage", 8, 16, mux="m1", factor="0.01"),
@@ -276,28 +313,31 @@ def paged(kind: int, cycle: int, delay: int = 0, start: bool = False) -> Bench:
         Sig("BecTemperature", 8, 8, signed=True, mux="m9"),
         Sig("AliveCounter", 56, 8),
     ]
-    return Bench([(Msg("EscPaged", 0x100, 8, signals), kind, cycle, delay)], start=start)
+    message = Msg("EscPaged", 0x100, 8, signals)
+    return Bench([(message, kind, cycle, delay)], start=start)
 
 
 NOTHING = {1: 0xFFFF, 5: 0x80, 9: 0x80}
+"""Codes for "not available", by page."""
 
 
 @pytest.mark.parametrize("kind", [EVENT, ON_CHANGE])
 @pytest.mark.parametrize("delay", [0, 30])
-def test_after_a_loss_each_page_says_by_itself_that_its_value_is_gone(
-    kind: int, delay: int
-) -> None:
+def test_after_a_loss_each_page_is_sent_as_not_available(kind: int, delay: int) -> None:
     bench = paged(kind, 0, delay, start=True)
     bench.until(SECOND)
-    # at the start, without an event
+    # at the start each page is sent without an event
     assert [frame.data[0] for _, frame in bench.sent] == list(NOTHING)
     for number in range(12):
         bench.until(bench.now + 10 * MS)
-        bench.live(LiveData(battery_voltage=2400 + number, throttle=number, bec_temperature=number))
+        live = LiveData(battery_voltage=2400 + number, throttle=number, bec_temperature=number)
+        bench.live(live)
     bench.until(bench.now + TIMEOUT - MS)
     bench.forget()
     bench.until(bench.now + SECOND)
-    last = {frame.data[0]: int.from_bytes(frame.data[1:3], "little") for _, frame in bench.sent}
+    last = {}
+    for _, frame in bench.sent:
+        last[frame.data[0]] = int.from_bytes(frame.data[1:3], "little")
     assert last == NOTHING
 
 
@@ -309,46 +349,56 @@ def test_multiplexer_pages_take_turns(kind: int, cycle: int) -> None:
     bench.feed(300 * MS, 10 * MS, LIVE._replace(throttle=-3, bec_temperature=40))
     pages = bench.raws(8)
     assert len(pages) >= 28
-    assert all((a, b) in {(1, 5), (5, 9), (9, 1)} for a, b in pairwise(pages))
-    assert all(b - a == 1 for a, b in pairwise(bench.raws(8, 56)))
+    assert set(pairwise(pages)) <= {(1, 5), (5, 9), (9, 1)}
+    counters = bench.raws(8, 56)
+    assert all(after - before == 1 for before, after in pairwise(counters))
     if kind == EVENT:
         value = {1: 2442, 5: 0xFD, 9: 40}
         assert bench.raws(16, 8) == [value[page] for page in pages]
 
 
-def test_of_multiplexed_pages_sent_on_change_the_changed_one_goes() -> None:
+def test_only_the_changed_page_is_sent_on_change() -> None:
     bench = paged(ON_CHANGE, 0)
     hot = LIVE._replace(bec_temperature=99)
-    for number, live in enumerate((LIVE, LIVE, LIVE, LIVE, hot, hot, hot._replace(throttle=1)), 1):
+    fast = hot._replace(throttle=1)
+    for number, live in enumerate((LIVE, LIVE, LIVE, LIVE, hot, hot, fast), 1):
         bench.until(number * 10 * MS)
         bench.live(live)
     assert bench.raws(8) == [1, 5, 9, 9, 5]
 
 
-def test_a_cycle_adds_its_page_to_a_changed_one_that_had_to_wait() -> None:
+def test_a_cycle_sends_its_page_in_addition_to_a_changed_page_put_off() -> None:
     signals = [
         Sig("Page", 0, 8, mux="M"),
         Sig("BatteryVoltage", 8, 16, mux="m1", factor="0.01"),
         Sig("Throttle", 8, 16, signed=True, mux="m2"),
     ]
-    bench = Bench([(Msg("EscPaged", 0x100, 8, signals), CYCLIC_AND_ON_CHANGE, 100, 30)])
+    message = Msg("EscPaged", 0x100, 8, signals)
+    bench = Bench([(message, CYCLIC_AND_ON_CHANGE, 100, 30)])
     for at, throttle in ((130, 0), (190, 5), (210, 6)):
         bench.until(at * MS)
         bench.live(volts(1)._replace(throttle=throttle))
     bench.until(290 * MS)
     sent = list(zip(bench.times(), bench.raws(8), bench.raws(16, 8), strict=True))
     assert sent == [
-        (0, 1, 0xFFFF), (100, 2, 0x8000), (130, 1, 1), (160, 2, 0), (190, 2, 5), (220, 2, 6), (250, 1, 1),
-    ]  # fmt: skip
+        (0, 1, 0xFFFF),
+        (100, 2, 0x8000),
+        (130, 1, 1),
+        (160, 2, 0),
+        (190, 2, 5),
+        (220, 2, 6),
+        (250, 1, 1),
+    ]
 
 
-# --- the gateway itself -------------------------------------------------------------------------------------------------
+# --- the status of the gateway
 
 
 @pytest.mark.parametrize("kind", [ON_CHANGE, EVENT, CYCLIC_AND_ON_CHANGE])
-def test_the_gateway_status_goes_when_it_changes(kind: int) -> None:
+def test_the_gateway_status_is_sent_when_it_changes(kind: int) -> None:
     names = ("GatewayState", "CanState", "EscsOk", "EscCount")
-    message = Msg("Health", 0x100, 8, [Sig(name, 8 * n, 8) for n, name in enumerate(names)])
+    signals = [Sig(name, 8 * place, 8) for place, name in enumerate(names)]
+    message = Msg("Health", 0x100, 8, signals)
     cycle = 10_000 if kind == CYCLIC_AND_ON_CHANGE else 0
     bench = Bench([(message, kind, cycle, 0)], ("left", "right"), start=True)
     bench.until(5 * MS)
@@ -363,20 +413,21 @@ def test_the_gateway_status_goes_when_it_changes(kind: int) -> None:
     bench.gateway.stop(bench.now)
     bench.take()
     data = [tuple(frame.data[:4]) for _, frame in bench.sent]
-    if kind == EVENT:  # without a cycle it comes each second, for its counters
+    if kind == EVENT:  # without a cycle it is sent each second because of its counters
         assert data.pop(3) == data[2]
     assert data == [(1, 1, 0, 2), (1, 1, 1, 2), (1, 1, 0, 2), (2, 1, 0, 2)]
     assert bench.times()[2] == 290
 
 
-def test_the_last_word_is_every_page_that_changed_without_regard_to_the_minimum_distance() -> None:
+def test_at_the_stop_every_changed_page_is_sent_despite_the_distance() -> None:
     signals = [
         Sig("Page", 0, 8, mux="M"),
         Sig("GatewayState", 8, 8, mux="m1"),
         Sig("CanState", 8, 8, mux="m2"),
         Sig("EscCount", 8, 8, mux="m3"),
     ]
-    bench = Bench([(Msg("Health", 0x300, 8, signals), ON_CHANGE, 0, 400)], start=True)
+    message = Msg("Health", 0x300, 8, signals)
+    bench = Bench([(message, ON_CHANGE, 0, 400)], start=True)
     bench.until(1100 * MS)
     bench.gateway.set_can_state(CanState.BUS_OFF, bench.now)
     bench.now = 1150 * MS
@@ -387,22 +438,24 @@ def test_the_last_word_is_every_page_that_changed_without_regard_to_the_minimum_
     assert sorted(sent[3:]) == [(1150, 1, 2), (1150, 2, 4)]
 
 
-# --- any run ----------------------------------------------------------------------------------------------------------
+# --- any run
+
+STEP = st.tuples(st.integers(0, 400), st.sampled_from(["live", "lost", "wait"]))
+"""A time in ms, and an event after it."""
 
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(
-        st.tuples(st.integers(0, 400), st.sampled_from(["live", "lost", "wait"])), max_size=40
-    ),
+    st.lists(STEP, max_size=40),
     st.sampled_from([EVENT, ON_CHANGE, CYCLIC, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE]),
     st.sampled_from([0, 5, 30]),
     st.booleans(),
 )
-def test_no_frame_is_ever_older_than_the_time_out_or_closer_than_the_minimum_distance(
+def test_frames_keep_the_time_out_and_the_minimum_distance(
     steps: list[tuple[int, str]], kind: int, delay: int, late: bool
 ) -> None:
-    bench = lone(kind, 40 if kind in (CYCLIC, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE) else 0, delay)
+    is_cyclic = kind in (CYCLIC, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE)
+    bench = lone(kind, 40 if is_cyclic else 0, delay)
     newest: dict[int, int] = {}
     for number, (step, what) in enumerate(steps, 1):
         when = bench.now + step * MS
@@ -417,7 +470,8 @@ def test_no_frame_is_ever_older_than_the_time_out_or_closer_than_the_minimum_dis
             bench.gateway.port(0, False, bench.now)
             bench.take()
     bench.until(bench.now + SECOND)
-    assert all(after - before >= delay * MS for (before, _), (after, _) in pairwise(bench.sent))
+    times = [when for when, _ in bench.sent]
+    assert all(after - before >= delay * MS for before, after in pairwise(times))
     for when, frame in bench.sent:
         value = get(frame.data, 0, 16, True)
         assert value == 65535 or when - newest[value] <= TIMEOUT
@@ -425,5 +479,6 @@ def test_no_frame_is_ever_older_than_the_time_out_or_closer_than_the_minimum_dis
     last_not_available = [value == 65535 for value in values]
     if values and kind in (EVENT, ON_CHANGE):
         assert last_not_available[-1]
-        # a caller that skips deadlines between two reads may have a value put off and lost again, and the loss said twice
-        assert late or not any(a and b for a, b in pairwise(last_not_available))
+        # If the caller skips deadlines between two reads, a value may be put off and lost again.
+        # Then the loss is reported twice.
+        assert late or (True, True) not in pairwise(last_not_available)
