@@ -28,7 +28,7 @@ def test_a_short_run_of_the_three_programs_gives_a_table(
         (RuntimeError("c ended"), 1, "failed: RuntimeError: c ended"),
     ],
 )
-def test_only_what_fails_is_an_error(
+def test_only_a_failed_benchmark_is_an_error(
     outcome: Figure | Exception,
     code: int,
     said: str,

@@ -20,7 +20,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]
     return tmp_path / "gateway.toml", tmp_path / "etc.toml"
 
 
-def test_json_has_keys_and_warnings_or_the_mistakes(tmp_path: Path) -> None:
+def test_json_contains_keys_and_warnings_or_the_mistakes(tmp_path: Path) -> None:
     done = run("check", "--json", written(tmp_path / "g.toml", LEAST))
     found = json.loads(done.out)
     assert (done.code, done.err, found["mistakes"], found["warnings"]) == (0, "", [], [])
@@ -33,7 +33,7 @@ def test_json_has_keys_and_warnings_or_the_mistakes(tmp_path: Path) -> None:
     assert [".pole_pair" in line for line in json.loads(done.out)["mistakes"]] == [True, False]
 
 
-def test_the_details_are_the_keys_in_effect_and_the_tables_of_describe(tmp_path: Path) -> None:
+def test_the_details_are_the_keys_in_effect_and_the_tables(tmp_path: Path) -> None:
     file = written(tmp_path / "g.toml", f"{LEAST}[dronecan]\nenabled = true\n")
     found = run("check", "-v", file).out.splitlines()
     assert found[: len(short := run("check", file).out.splitlines())] == short
@@ -44,7 +44,7 @@ def test_the_details_are_the_keys_in_effect_and_the_tables_of_describe(tmp_path:
 
 
 @pytest.mark.parametrize("command", ["check", "doctor", "run"])
-def test_without_a_name_the_configuration_of_the_folder_comes_before_the_machines(
+def test_the_folders_configuration_is_preferred_to_the_machines(
     places: tuple[Path, Path], command: str
 ) -> None:
     own, machine = places
@@ -58,7 +58,7 @@ def test_without_a_name_the_configuration_of_the_folder_comes_before_the_machine
     assert "of_the_machine" not in said.out + said.err
 
 
-def test_commands_that_also_work_without_one_say_which_they_take(places: tuple[Path, Path]) -> None:
+def test_commands_report_the_configuration_that_they_found(places: tuple[Path, Path]) -> None:
     own, _ = places
     assert run("dbc").err == ""
     written(own, f'{LEAST}name = "left"\n[[esc]]\nname = "right"\nport = "x"\n')
@@ -74,7 +74,7 @@ def test_commands_that_also_work_without_one_say_which_they_take(places: tuple[P
     assert "run -c gateway.toml" in refused(3, "status")
 
 
-def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another_layout(
+def test_the_fingerprint_identifies_the_layout_in_file_and_frames(
     places: tuple[Path, Path],
 ) -> None:
     own, _ = places
@@ -96,7 +96,7 @@ def test_the_fingerprint_is_the_same_in_the_file_as_sent_and_another_for_another
 
 @pytest.mark.rights
 @pytest.mark.parametrize(("code", "words"), [(2, "check"), (2, "decode gateway.toml")])
-def test_what_may_not_be_read_is_one_line(
+def test_an_unreadable_file_is_reported_in_one_line(
     places: tuple[Path, Path], code: int, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Within this process, so that root can lay its rights down for the moment: root may read everything."""
@@ -116,7 +116,7 @@ def test_what_may_not_be_read_is_one_line(
     assert "Permission denied" in said
 
 
-def test_the_load_is_shown_as_it_is_usually_and_at_worst(tmp_path: Path) -> None:
+def test_the_usual_and_the_worst_bus_load_are_shown(tmp_path: Path) -> None:
     """EscStatus of the shipped DBC is sent every 100 ms and on change; TPDO 4 on change."""
     file = written(tmp_path / "g.toml", f"{LEAST}[canopen]\nenabled = true\nstore = 'x'\n")
     found = json.loads(run("check", "--json", file).out)
@@ -133,9 +133,7 @@ def test_the_load_is_shown_as_it_is_usually_and_at_worst(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("text", [f"x = {'9' * 5000}", f"x = {'[' * 5000}"])
-def test_toml_beyond_the_limits_of_python_is_described_in_words_for_users(
-    text: str, tmp_path: Path
-) -> None:
+def test_toml_beyond_the_limits_of_python_is_explained_to_users(text: str, tmp_path: Path) -> None:
     said = refused(2, "check", written(tmp_path / "g.toml", text))
     assert said.endswith("is not valid TOML: a number in it is too long, or it is nested too deep")
 
@@ -147,7 +145,7 @@ def test_toml_beyond_the_limits_of_python_is_described_in_words_for_users(
         (b"\xff", "the password is no text in UTF-8"),
     ],
 )
-def test_a_password_file_is_refused_in_words_for_users(
+def test_a_bad_password_file_is_explained_to_users(
     content: bytes | None, said: str, tmp_path: Path
 ) -> None:
     if content is not None:
@@ -161,7 +159,7 @@ def test_a_password_file_is_refused_in_words_for_users(
     ("content", "said"),
     [(None, "cannot be read: No such file or directory"), (b"x", "cannot be used for TLS")],
 )
-def test_a_certificate_is_refused_in_words_for_users(
+def test_a_bad_certificate_is_explained_to_users(
     content: bytes | None, said: str, tmp_path: Path
 ) -> None:
     if content is not None:

@@ -42,19 +42,19 @@ def terminal() -> Iterator[PtyEsc]:
 
 
 @pytest.mark.parametrize("words", ["replay a --on=tape --to=tape", "replay -h --to tape"])
-def test_a_removed_option_is_one_line_with_what_to_type_instead(words: str) -> None:
+def test_a_removed_option_is_refused_with_its_replacement(words: str) -> None:
     assert refused(2, *words.split()).startswith("--to: was removed. Type --on can or --on pty. ")
     assert "unrecognized arguments: --to" in refused(2, "schema", "--to")
     assert "there is no such file" in refused(2, "decode", "--", "--stats")
 
 
 @pytest.mark.parametrize("words", ["describe --form json", "service install --root . --chan can1"])
-def test_the_beginning_of_an_option_is_none(words: str) -> None:
+def test_an_abbreviated_option_is_refused(words: str) -> None:
     """A script that abbreviates would mean another option after an update."""
     assert f"unrecognized arguments: {words.split()[-2]}" in refused(2, *words.split())
 
 
-def test_no_removed_option_is_in_use() -> None:
+def test_removed_options_are_not_in_use_again() -> None:
     for (command, option), advice in REMOVED_OPTIONS.items():
         name, _, choice = option.partition(" ")
         usage = run(command, "--help").out
@@ -87,7 +87,7 @@ def forbidden(path: str, mode: int) -> list[str]:
     ("mode", "remedy"),
     [(0o660, "Join its group: sudo usermod -aG {} $USER"), (0o600, "chmod g+rw")],
 )
-def test_a_port_without_permission_names_the_group_to_join_if_that_helps(
+def test_a_port_without_permission_is_reported_with_the_group_to_join(
     tmp_path: Path, terminal: PtyEsc, mode: int, remedy: str
 ) -> None:
     with contextlib.suppress(LookupError, PermissionError):
@@ -105,7 +105,7 @@ def test_a_port_without_permission_names_the_group_to_join_if_that_helps(
     assert ("usermod" in done.stderr) == (mode == 0o660)
 
 
-def test_one_device_by_two_names_is_refused(tmp_path: Path, terminal: PtyEsc) -> None:
+def test_two_names_of_one_device_are_refused(tmp_path: Path, terminal: PtyEsc) -> None:
     link = tmp_path / "by-id"
     link.symlink_to(terminal.path)
     file = configuration(tmp_path, terminal.path)
@@ -128,7 +128,7 @@ LONG = "x" * 300
         *(f"monitor {LONG}", f"dbc -o {LONG}", f"check {LONG}", f"service install --root {LONG}"),
     ],
 )
-def test_a_name_that_is_too_long_is_one_line(
+def test_a_name_that_is_too_long_is_reported_in_one_line(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -138,7 +138,7 @@ def test_a_name_that_is_too_long_is_one_line(
     assert "File name too long" in done.err
 
 
-def test_socketcan_that_is_not_there_is_reported_with_the_command_that_makes_it(
+def test_a_missing_can_interface_is_reported_with_the_command_to_create_it(
     tmp_path: Path, terminal: PtyEsc
 ) -> None:
     file = configuration(tmp_path, terminal.path, can='channel = "nocan7"')
@@ -153,7 +153,7 @@ def test_socketcan_that_is_not_there_is_reported_with_the_command_that_makes_it(
 # --- dbc
 
 
-def test_a_dbc_goes_into_a_pipe_and_through_a_link_without_replacing_them(tmp_path: Path) -> None:
+def test_a_dbc_is_written_into_a_pipe_or_link_without_replacing_it(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     reader = subprocess.Popen(["cat", str(pipe)], stdout=subprocess.PIPE, text=True)
@@ -179,13 +179,13 @@ def shell(command: str) -> Done:
 
 
 @pytest.mark.parametrize("words", ["schema", "init -", "dbc --esc 1"])
-def test_a_full_disk_at_standard_output_is_one_line(words: str) -> None:
+def test_a_full_disk_at_standard_output_is_reported_in_one_line(words: str) -> None:
     done = shell(f"PROGRAM {words} >/dev/full")
     assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
     assert "standard output: cannot be written: No space left on device" in done.stderr
 
 
-def test_a_closed_standard_output_or_a_reader_that_goes_away_is_no_reason_for_a_traceback(
+def test_a_closed_standard_output_causes_no_traceback(
     tmp_path: Path,
 ) -> None:
     done = shell(f"exec PROGRAM init {tmp_path}/a.toml >&-")
@@ -243,7 +243,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
         ),
     ],
 )
-def test_a_time_that_is_too_long_is_called_so(words: str, said: str) -> None:
+def test_a_time_that_is_too_long_is_refused(words: str, said: str) -> None:
     assert refused(2, *words.split()).endswith(said)
 
 

@@ -29,7 +29,7 @@ def written(tmp_path: Path, words: str) -> list[Frame]:
     return frames_of((tmp_path / "out.bin").read_bytes())
 
 
-def test_the_bytes_of_a_file_and_of_standard_output_are_those_of_the_simulator(
+def test_a_file_and_standard_output_get_the_simulators_bytes(
     tmp_path: Path,
 ) -> None:
     words = ["simulate", "--seconds", "90", "--seed", "5", "--out"]
@@ -43,7 +43,7 @@ def test_the_bytes_of_a_file_and_of_standard_output_are_those_of_the_simulator(
     assert {frame.layout for file in files for frame in frames_of(file)} == {Layout.LEGACY}
 
 
-def test_error_bits_and_the_device_are_as_asked(tmp_path: Path) -> None:
+def test_error_bits_and_the_device_are_as_requested(tmp_path: Path) -> None:
     words = "--error undervoltage@1s+500ms --error BEC-overcurrent@2 --device kontrol-x"
     frames = written(tmp_path, f"{words} --seconds 6")
     errors = [f.data.operating_errors for f in frames if isinstance(f.data, LiveData)]
@@ -57,7 +57,7 @@ def test_error_bits_and_the_device_are_as_asked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_escs_on_terminals_are_listed_and_send_until_the_signal(
+def test_escs_on_terminals_are_listed_and_send_until_a_signal(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     words = [*COMMAND, "--esc", "2", "--link", str(tmp_path / "esc{n}"), "--layout", "legacy"]
@@ -83,7 +83,7 @@ def test_escs_on_terminals_are_listed_and_send_until_the_signal(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_gateway_that_transmits_is_reported_loudly() -> None:
+def test_a_gateway_that_transmits_to_the_esc_is_reported() -> None:
     pipe = subprocess.PIPE
     with subprocess.Popen(COMMAND, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout
@@ -102,7 +102,7 @@ def test_a_gateway_that_transmits_is_reported_loudly() -> None:
     assert process.returncode == 1
 
 
-def test_a_real_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
+def test_a_regular_file_in_place_of_the_link_is_not_replaced(tmp_path: Path) -> None:
     link = tmp_path / "esc2"
     link.write_text("precious")
     said = refused(1, "simulate", "--esc", "2", "--link", tmp_path / "esc{n}", "--seconds", "1")
@@ -111,5 +111,5 @@ def test_a_real_file_in_the_links_place_is_left_alone(tmp_path: Path) -> None:
     assert link.read_text() == "precious"
 
 
-def test_what_is_lost_and_disturbed_is_missing_and_the_rest_is_decoded(tmp_path: Path) -> None:
+def test_lost_and_disturbed_frames_are_missing_and_the_rest_is_decoded(tmp_path: Path) -> None:
     assert 150 < len(written(tmp_path, "--seconds 3 --flip-bits 3e-4 --dropout 500ms/2s")) < 253

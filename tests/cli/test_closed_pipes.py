@@ -75,7 +75,7 @@ def closed(
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_a_command_whose_reader_has_gone_ends_without_a_word(words: str, folder: Path) -> None:
+def test_a_command_without_a_reader_ends_silently(words: str, folder: Path) -> None:
     done = closed(words, folder, has_closed_stderr=False)
     unexpected = [line for line in done.stderr.splitlines() if line not in NOTES]
     assert unexpected == []
@@ -83,5 +83,5 @@ def test_a_command_whose_reader_has_gone_ends_without_a_word(words: str, folder:
 
 
 @pytest.mark.parametrize("words", ["eds", "check none.toml", "statsu", "run --help"])
-def test_messages_that_nobody_reads_do_no_harm(words: str, folder: Path) -> None:
+def test_unread_messages_do_not_change_the_result(words: str, folder: Path) -> None:
     assert closed(words, folder, has_closed_stderr=True).returncode == CLOSED

@@ -52,7 +52,7 @@ def test_bash_completes_commands_options_choices_and_files_of_the_right_kind(
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
-def test_there_is_a_script_for_each_shell(shell: str) -> None:
+def test_each_shell_has_a_completion_script(shell: str) -> None:
     done = run("completion", shell)
     assert (done.code, done.err) == (0, "")
     assert all(command in done.out for command in COMMANDS)

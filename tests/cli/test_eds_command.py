@@ -81,7 +81,7 @@ def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
     ]
 
 
-def test_what_is_in_the_dcf_is_what_the_node_answers() -> None:
+def test_the_node_answers_with_the_values_of_the_dcf() -> None:
     """Byte for byte: encoded by the canopen library, and as an SDO upload gives it."""
     node = shipped_canopen([5]).nodes([EscSettings()]).nodes[0]
     made = command("--node-id", 5)[1]

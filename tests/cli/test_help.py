@@ -38,12 +38,12 @@ def test_help_fits_80_columns_and_has_a_description(parser: argparse.ArgumentPar
     assert not re.search(r"  the same$|^The same as", text, re.MULTILINE), "before its referent"
 
 
-def test_every_command_is_looked_at() -> None:
+def test_every_command_is_tested() -> None:
     assert {f"kontronik-can-gw {name}" for name in COMMANDS} <= {each.prog for each in EVERY}
     assert "kontronik-can-gw service install" in {each.prog for each in EVERY}
 
 
-def test_dronecan_is_named_wherever_the_program_is_described() -> None:
+def test_dronecan_is_named_in_every_description_of_the_program() -> None:
     texts = {
         "help": make_parser().description or "",
         "run": COMMANDS["run"],
@@ -76,7 +76,7 @@ def test_dronecan_is_named_wherever_the_program_is_described() -> None:
         ("convert a b --forse", " convert", "--forse. Did you mean --force?\n"),
     ],
 )
-def test_a_mistyped_command_line_shows_its_usage_and_what_was_meant(
+def test_a_mistyped_command_line_shows_usage_and_suggestion(
     words: str, usage: str, said: str
 ) -> None:
     done = run(*words.split())

@@ -31,7 +31,7 @@ def test_each_extra_has_the_library_of_pyproject() -> None:
         ),
     ],
 )
-def test_a_virtual_environment_gets_the_library_itself(
+def test_in_a_virtual_environment_the_advice_installs_the_library_alone(
     prefix: str, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "prefix", prefix)
@@ -42,7 +42,7 @@ def test_a_virtual_environment_gets_the_library_itself(
 
 
 @pytest.mark.parametrize("is_debian", [True, False])
-def test_the_debian_package_names_an_installation_from_a_clone(
+def test_in_the_debian_package_the_advice_is_to_install_a_clone(
     is_debian: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "prefix", "/usr")
@@ -56,7 +56,7 @@ def test_the_debian_package_names_an_installation_from_a_clone(
     assert (" -m pip install --upgrade 'pyarrow>=15'" in said) != is_debian
 
 
-def test_nothing_names_an_index_on_which_the_package_is_not() -> None:
+def test_no_text_names_an_index_that_lacks_the_package() -> None:
     """The package is on no index: an extra of it can only be installed from a clone."""
     places = [PROJECT / "README.md", *(PROJECT / "kontronik_can_gw").rglob("*.py")]
     for folder in ("docs", "examples"):

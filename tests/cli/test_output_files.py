@@ -61,7 +61,7 @@ def test_a_file_that_exists_is_replaced_only_with_force(command: str, folder: Pa
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_an_output_that_cannot_be_written_leaves_nothing(command: str, folder: Path) -> None:
+def test_an_output_that_cannot_be_written_leaves_no_file(command: str, folder: Path) -> None:
     before = names(folder)
     for output, code in (("none/out", 1), ("x.bin/out", 1), (".", 2)):
         done = run(*command.format(o=output).split(), "--force")
@@ -90,7 +90,7 @@ def test_an_output_that_cannot_be_written_leaves_nothing(command: str, folder: P
         ("report -c gateway.toml x.bin -o {o}", "own.dbc"),
     ],
 )
-def test_an_input_is_never_written_over(command: str, source: str, way: str, folder: Path) -> None:
+def test_an_input_is_never_overwritten(command: str, source: str, way: str, folder: Path) -> None:
     assert run("eds", "-o", "own.eds").code == 0
     nodes = CONFIGURATION + '[canopen]\nenabled = true\neds = "own.eds"\n'
     written(folder / "nodes.toml", nodes)
@@ -112,7 +112,7 @@ def test_an_input_is_never_written_over(command: str, source: str, way: str, fol
     assert path.read_bytes() == before
 
 
-def test_an_export_replaces_only_with_force_and_no_input(folder: Path) -> None:
+def test_an_export_replaces_files_only_with_force_and_never_its_input(folder: Path) -> None:
     assert run("export", "c", "-o", "fw").code == 0
     (folder / "fw" / "example_main.c").write_text("mine")
     done = run("export", "c", "--dbc", "own.dbc", "fw")
@@ -126,14 +126,14 @@ def test_an_export_replaces_only_with_force_and_no_input(folder: Path) -> None:
     assert (folder / "own.dbc").read_text().startswith("VERSION")
 
 
-def test_two_outputs_or_none_are_refused() -> None:
+def test_two_outputs_are_refused_and_so_is_a_missing_output() -> None:
     assert "OUT and -o: are two outputs" in run("convert", "x.bin", "a.csv", "-o", "b.csv").err
     assert "there is no output. Give OUT, or -o OUT." in run("convert", "x.bin").err
     assert run("init", "a", "-o", "b").code == run("export", "c").code == 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_signal_leaves_no_half_written_file(number: int, folder: Path) -> None:
+def test_a_signal_leaves_no_partly_written_file(number: int, folder: Path) -> None:
     before = names(folder)
     command = [*PROGRAM, "simulate", "--seconds", "1000h", "-o", "long.bin"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
@@ -148,7 +148,7 @@ def test_a_signal_leaves_no_half_written_file(number: int, folder: Path) -> None
     assert names(folder) == before
 
 
-def test_a_full_disk_leaves_no_half_written_file(
+def test_a_full_disk_leaves_no_partly_written_file(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_fd: int) -> None:

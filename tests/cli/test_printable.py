@@ -27,7 +27,7 @@ def is_clean(text: str) -> bool:
     return all(c.isprintable() or c in "\n\t" for c in text)
 
 
-def test_what_a_terminal_obeys_is_shown_as_a_question_mark() -> None:
+def test_control_characters_are_shown_as_question_marks() -> None:
     assert printable(EVIL) == SHOWN
     assert printable("Größe 5 µΩ ‰ 温度 €") == "Größe 5 µΩ ‰ 温度 €"
     assert printable("a\tb\n\x1b", keep="\n\t") == "a\tb\n?"
@@ -40,14 +40,14 @@ def test_what_a_terminal_obeys_is_shown_as_a_question_mark() -> None:
 # --- the places where text goes out
 
 
-def test_talk_lines_and_errors(capsys: pytest.CaptureFixture[str]) -> None:
+def test_printed_lines_and_errors_are_cleaned(capsys: pytest.CaptureFixture[str]) -> None:
     say(EVIL)
     show(EVIL)
     assert capsys.readouterr() == (f"{SHOWN}\n", f"kontronik-can-gw: {SHOWN}\n")
     assert UserError(EVIL, "b").problems == (SHOWN, "b")
 
 
-def test_a_log_line_is_one_line() -> None:
+def test_a_log_message_stays_one_line() -> None:
     stream = io.StringIO()
     handler = BackgroundHandler(stream, longest_end_s=60)
     try:
@@ -81,14 +81,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("words", [["describe"], ["describe", "--format", "json"]])
-def test_what_is_described_by_hostile_files(words: list[str], folder: Path) -> None:
+def test_descriptions_of_hostile_files_are_cleaned(words: list[str], folder: Path) -> None:
     done = run(*words, "-c", folder / "gateway.toml")
     assert done.code == 0, done.err
     assert "?EVIL?" in done.out or "\\u001bEVIL\\u0007" in done.out
     assert is_clean(done.out + done.err)
 
 
-def test_a_file_that_is_shown_on_a_terminal_is_text(
+def test_a_file_shown_on_a_terminal_is_cleaned(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for is_terminal in (False, True):  # into a pipe it goes as it is
@@ -110,7 +110,7 @@ def test_a_file_that_is_shown_on_a_terminal_is_text(
         ("\x1b]0;x\x07.bin", "", "decode"),
     ],
 )
-def test_what_is_wrong_with_hostile_files(
+def test_error_messages_about_hostile_files_are_cleaned(
     name: str, content: str, words: str, tmp_path: Path
 ) -> None:
     path = tmp_path / name

@@ -53,7 +53,7 @@ def folder(tmp_path: Path) -> Path:
         ("kontronik_can_gw.cli.run", ["run", "-c", "gateway.toml"]),
     ],
 )
-def test_ctrl_c_while_modules_are_loaded_ends_it_without_a_word(
+def test_ctrl_c_while_modules_are_loaded_ends_silently(
     module: str, words: list[str], start: str, folder: Path
 ) -> None:
     code = INTERRUPTED.format(module=module, words=words, start=start, loaded=["argparse"])
@@ -61,7 +61,7 @@ def test_ctrl_c_while_modules_are_loaded_ends_it_without_a_word(
     assert (done.returncode, done.stderr) in ((-signal.SIGINT, ""), (130, ""))
 
 
-def test_who_has_ctrl_c_ignored_is_not_ended_by_it(folder: Path) -> None:
+def test_an_ignored_ctrl_c_does_not_end_the_program(folder: Path) -> None:
     """As of a shell script's background jobs."""
     code = "import signal; signal.signal(2, signal.SIG_IGN)\n" + INTERRUPTED
     code = code.format(module="kontronik_can_gw.cli", words=["schema"], start=AS_MODULE, loaded=[])
@@ -69,7 +69,7 @@ def test_who_has_ctrl_c_ignored_is_not_ended_by_it(folder: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_too_few_open_files_are_one_line(folder: Path) -> None:
+def test_too_few_open_files_are_reported_in_one_line(folder: Path) -> None:
     command = [sys.executable, "-m", "kontronik_can_gw", "simulate", "--esc", "40"]
     done = run("sh", "-c", LIMITED, "40", *command, folder=folder)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)

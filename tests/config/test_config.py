@@ -317,7 +317,7 @@ def test_any_text_can_be_written_as_toml() -> None:
     check_toml(parse(tomllib.loads(uncommented()), str(EXAMPLE)))
 
 
-def test_values_that_only_the_parser_refuses_are_known() -> None:
+def test_values_that_only_the_parser_refuses_are_listed() -> None:
     only_parser = [
         tables("esc", "gear", "1/0"),
         tables("esc", "pole_pairs", 7.0),  # a whole number in JSON, a float in TOML

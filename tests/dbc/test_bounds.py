@@ -52,7 +52,7 @@ def nested(depth: int, width: int) -> str:
         (" " * MAX_BYTES, "is larger than 8 MB"),
     ],
 )
-def test_what_is_out_of_bounds_is_one_line_and_cantools_is_not_called(
+def test_a_file_out_of_bounds_is_refused_in_one_line_without_cantools(
     text: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -84,5 +84,5 @@ def test_a_file_without_end_is_read_up_to_the_limit() -> None:
         f'{ONE}CM_ BO_ 1 "part 1E123456, http://x";',
     ],
 )
-def test_what_real_files_have_is_read(text: str) -> None:
+def test_unusual_entries_of_real_files_are_read(text: str) -> None:
     assert parse_database((HEAD + text).encode(), "my.dbc").messages

@@ -71,9 +71,7 @@ def test_an_attribute_with_a_text_that_its_enumeration_lacks_is_refused() -> Non
         ('BA_DEF_DEF_ "Colour" 1;', 'BA_DEF_DEF_ "Colour"'),
     ],
 )
-def test_an_entry_for_what_is_not_in_the_file_is_ignored_with_a_warning(
-    entry: str, words: str
-) -> None:
+def test_an_entry_for_a_missing_object_is_ignored_with_a_warning(entry: str, words: str) -> None:
     warnings: list[str] = []
     comment = entry.replace('"', "")
     text = f'{STATE}CM_ SG_ 256 OperatingState "{comment}";\n{entry}\n'
@@ -90,7 +88,7 @@ SPELLED = [IRRATIONAL, *((unit, *row) for unit, rows in UNITS.items() for row in
 
 
 @pytest.mark.parametrize(("unit", "texts", "factor", "shift"), SPELLED)
-def test_a_unit_is_known_however_it_is_spelled(
+def test_a_unit_is_recognised_in_each_of_its_spellings(
     unit: str, texts: str, factor: str, shift: str
 ) -> None:
     meant = pytest.approx([float(Fraction(factor)), float(Fraction(shift))], rel=1e-11)
@@ -105,7 +103,7 @@ def test_a_unit_of_another_quantity_or_of_two_meanings_is_refused() -> None:
         assert [conversion(unit, text) for text in texts.split()] == [None] * len(texts.split())
 
 
-def test_dbc_units_says_what_a_text_means_whatever_it_means_elsewhere() -> None:
+def test_dbc_units_overrides_the_usual_meaning_of_a_text() -> None:
     text = MESSAGE + signal("BatteryVoltage", "0|16@1+", "Zaehler", "0.01,0")
     text += signal("BecVoltage", "16|16@1+", "A")
     units = {"Zaehler": "mV", "A": "mV"}
@@ -141,7 +139,7 @@ ECU = (
 GATEWAYS: dict[str, Any] = {"node": "Gateway", "unbound": "start_value"}
 
 
-def test_a_pattern_that_names_no_message_of_ours_is_refused() -> None:
+def test_a_pattern_without_a_message_of_this_gateway_is_refused() -> None:
     lines = refused(ECU, messages=["Motr_11", "Motor_11", "Motor_9*", "qqq*"], **GATEWAYS)
     assert lines == [
         "dbc.messages: 'Motr_11' is no message of Gateway in my_car.dbc. Did you mean Motor_11?",
@@ -150,7 +148,7 @@ def test_a_pattern_that_names_no_message_of_ours_is_refused() -> None:
     ]
 
 
-def test_only_what_is_chosen_has_to_be_right_and_many_unbound_signals_come_with_advice() -> None:
+def test_only_selected_messages_are_checked_and_others_cause_advice() -> None:
     *lines, advice = refused(ECU, node="Gateway")
     assert len(lines) == 8
     assert all(words in advice for words in ("8 signals of Gateway", "dbc.messages", "start_value"))
@@ -158,7 +156,7 @@ def test_only_what_is_chosen_has_to_be_right_and_many_unbound_signals_come_with_
     assert "Motor_11.Motor_11X: no such source" in line
 
 
-def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() -> None:
+def test_an_unbound_signal_has_its_start_value_as_cantools_reads_it() -> None:
     layout = compiled(ECU, messages=["Motor_2?"], bind={"Gear": 5}, **GATEWAYS)
     gateway = gateway_with(layout, LiveData(battery_voltage=4442))
     database = parse_database(ECU.encode(), "my.dbc")
@@ -177,7 +175,7 @@ def test_a_signal_bound_to_nothing_holds_its_start_value_as_cantools_reads_it() 
     ]
 
 
-def test_a_start_value_may_be_every_number_that_the_signal_holds() -> None:
+def test_a_start_value_may_be_any_number_that_fits_into_the_signal() -> None:
     text = MESSAGE + signal("Foo", "7|12@0-") + START
     (theirs,) = parse_database(text.encode(), "my.dbc").messages
     for value in (-2048, 2047):
@@ -214,7 +212,7 @@ def all_sent(text: str, cycle: int = 20) -> str:
 
 
 @pytest.mark.parametrize("meant", SPELLINGS)
-def test_a_send_type_is_known_by_its_names_in_use(meant: str) -> None:
+def test_a_send_type_is_recognised_by_each_of_its_usual_names(meant: str) -> None:
     for text in SPELLINGS[meant].split():
         (plan,) = compiled(all_sent(text)).messages
         assert plan.send_type == (SEND_TYPES[meant] if meant else SendType.CYCLIC), text
@@ -223,7 +221,7 @@ def test_a_send_type_is_known_by_its_names_in_use(meant: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["No", "Wrong", "OnRequest", "cyclically"])
-def test_another_send_type_is_refused_unless_dbc_send_type_says_what_it_means(text: str) -> None:
+def test_an_unknown_send_type_is_refused_unless_dbc_send_type_defines_it(text: str) -> None:
     (line,) = refused(all_sent(text))
     assert f"GenMsgSendType {text!r} is not known" in line and f"dbc.send_type.{text!r}" in line
     for name, meaning in ((text, "CyclicAndEvent"), ("OnChange", "Event")):
@@ -244,14 +242,14 @@ NAMES = {
 }
 
 
-def test_a_counter_of_frames_and_a_checksum_are_known_by_their_names() -> None:
+def test_alive_counters_and_checksums_are_recognised_by_their_names() -> None:
     for role, names in NAMES.items():
         assert {name: protection(name) for name in names.split()} == dict.fromkeys(
             names.split(), role
         )
 
 
-def test_a_counter_is_sent_and_what_may_count_something_else_is_refused_unless_bound() -> None:
+def test_a_counter_is_sent_and_a_doubtful_counter_is_refused_unless_bound() -> None:
     text, other = MESSAGE + signal("COUNTER"), MESSAGE + signal("ErrorCounter")
     (line,) = refused(other)
     assert "no such source" in line
@@ -265,7 +263,7 @@ def test_a_counter_is_sent_and_what_may_count_something_else_is_refused_unless_b
 
 
 @pytest.mark.parametrize("counter", ["COUNTER", "Nothing"])
-def test_a_checksum_of_unknown_making_is_refused_until_somebody_says_what_it_is(
+def test_a_checksum_is_refused_until_the_configuration_defines_it(
     counter: str,
 ) -> None:
     text = MESSAGE + signal("CHKSM") + signal(counter, "8|4@1+")
@@ -281,7 +279,7 @@ def test_a_checksum_of_unknown_making_is_refused_until_somebody_says_what_it_is(
     assert compiled(text, bind=bind | {"CHKSM": 0}).messages[0].signals[0].role is Role.CONSTANT
 
 
-def test_what_0_5_0_sent_as_e2e_profile_1_by_its_names_goes_on_with_a_warning() -> None:
+def test_names_that_0_5_0_took_for_e2e_profile_1_cause_a_warning() -> None:
     text = MESSAGE + signal("Crc") + signal("Alive", "8|4@1+")
     warned = "".join(compiled(text).warnings)
     assert "AUTOSAR E2E profile 1" in warned and "= 0x100" in warned
@@ -318,7 +316,7 @@ SNA = 'VAL_ 256 Undervoltage 1 "NotAvailable" ;\n'
         (FLAG.replace("0|1@1+", "0|2@1+"), None, 3),  # two bits have room for a code
     ],
 )
-def test_a_flag_without_a_code_is_0_without_telemetry_or_what_is_asked_for(
+def test_without_telemetry_a_flag_is_0_or_its_configured_value(
     text: str, on_loss: int | None, raw: int
 ) -> None:
     layout = compiled(text, flags_on_loss=on_loss)
@@ -364,7 +362,7 @@ STATES = signal("OperatingState", "8|8@1+") + 'VAL_ 256 OperatingState 7 "MotorO
         (STATES + START + start_of("OperatingState", 7), None),
     ],
 )
-def test_the_signal_that_reports_the_loss_is_known_and_a_warning_where_there_is_none(
+def test_a_layout_without_a_signal_that_reports_the_loss_causes_a_warning(
     beside: str, name: str | None
 ) -> None:
     layout = compiled(FLAG + beside)
@@ -378,20 +376,20 @@ def test_the_signal_that_reports_the_loss_is_known_and_a_warning_where_there_is_
     assert not unreported(layout, silent=True)
 
 
-def test_of_two_escs_each_flag_needs_a_signal_of_its_own_esc() -> None:
+def test_each_flag_needs_a_signal_of_its_own_esc_to_report_the_loss() -> None:
     text = MESSAGE + signal("LeftUndervoltage", "0|1@1+") + signal("RightUndervoltage", "1|1@1+")
     layout = compiled(text + signal("LeftLinkState", "8|8@1+"), ("left", "right"))
     (line,) = unreported(layout, silent=False)
     assert "RightUndervoltage" in line and "LeftUndervoltage" not in line
 
 
-def test_a_float_of_another_length_is_refused_whatever_it_begins_with() -> None:
+def test_a_float_of_24_bits_is_refused_even_with_a_start_value() -> None:
     float_24 = signal("Throttle", "0|24@1-", "%") + "SIG_VALTYPE_ 256 Throttle : 1;\n"
     (line,) = refused(MESSAGE + float_24 + START + start_of("Throttle", 5))
     assert "a float of 24 bits cannot be sent" in line
 
 
-def test_a_capture_holds_how_a_dbc_is_used_and_one_of_0_5_0_has_less() -> None:
+def test_a_capture_stores_the_dbc_settings_and_0_5_0_stored_fewer() -> None:
     old = DbcConfig(bind={"A.B": 1}, base_id=5, e2e_data_ids={"M": 7}, on_loss="silent")
     later: dict[str, Any] = {"units": {"x": "V"}, "messages": ("Motor_*",), "flags_on_loss": 1}
     new = replace(old, send_type={"y": "Event"}, unbound="start_value", **later)
@@ -422,7 +420,9 @@ def test_a_comment_that_looks_like_a_baud_rate_is_kept() -> None:
 
 
 @pytest.mark.parametrize(("order", "said"), [("2", "2"), ("3", "3"), ("10", "10"), ("01", "01")])
-def test_a_byte_order_that_is_none_is_refused_by_name(order: str, said: str) -> None:
+def test_an_unknown_byte_order_is_refused_with_the_name_of_the_signal(
+    order: str, said: str
+) -> None:
     (line,) = refused(STATE.replace("@1", f"@{order}"))
     assert line == (
         f"{FILE}: Power.OperatingState: byte order {said} is neither 0 (Motorola) nor 1 (Intel). "
@@ -467,7 +467,7 @@ def test_a_message_with_a_transmitter_is_not_selected_by_name_alone() -> None:
     ("written", "used_ns"),
     [("12.5", 12_500_000), ("0.25", MS), ("33.333", 33_333_000), ("10", 10 * MS)],
 )
-def test_a_cycle_time_with_a_fraction_is_exact_or_named(
+def test_a_cycle_time_with_a_fraction_is_exact_or_causes_a_warning(
     kind: str, written: str, used_ns: int
 ) -> None:
     quoted = f'"{written}"' if kind == "STRING" else written

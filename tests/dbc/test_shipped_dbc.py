@@ -78,7 +78,7 @@ def test_limits_leave_out_the_codes_and_contain_0() -> None:
         assert low <= 0 <= high, signal.name
 
 
-def test_every_value_of_an_enumeration_that_is_sent_has_a_name_and_nothing_else_has() -> None:
+def test_exactly_the_values_of_enumerations_have_names() -> None:
     """One unknown sample costs asammdf all names."""
     named = [signal for signal in signals_of(SHIPPED) if names_of(signal)]
     assert {signal.name: names_of(signal) for signal in named} == ENUMS
@@ -98,7 +98,7 @@ FIELDS = [
 
 
 @pytest.mark.parametrize("field", FIELDS, ids=lambda field: field.name)
-def test_a_field_of_the_sheet_fits_its_signal_step_by_step(field: sheet.Field) -> None:
+def test_a_signal_holds_every_step_of_its_field_in_the_sheet(field: sheet.Field) -> None:
     name = pascal(field.name) + ("Percent" if field.unit == "%" else "")
     found = next(signal for signal in signals_of(SHIPPED) if signal.name == name)
     step = Decimal(1) / field.steps
@@ -137,7 +137,9 @@ def matrix_of(file: Path, caplog: pytest.LogCaptureFixture) -> Any:
 
 
 @BOTH
-def test_canmatrix_sees_what_cantools_sees(file: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_canmatrix_and_cantools_read_the_same_content(
+    file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     matrix, database = matrix_of(file, caplog), database_of(file)
     assert [ecu.name for ecu in matrix.ecus] == [node.name for node in database.nodes]
     attributes: Any = database.dbc
@@ -164,7 +166,7 @@ def test_canmatrix_sees_what_cantools_sees(file: Path, caplog: pytest.LogCapture
     sys.version_info >= (3, 13), reason="opendbc refuses Python 3.13: run it by an older one"
 )
 @BOTH
-def test_all_readers_find_the_same_raw_values_in_any_bytes(
+def test_all_readers_decode_the_same_raw_values_from_any_bytes(
     file: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """opendbc takes a path where one exists, else the name of a packaged file, and skips what it does not understand."""

@@ -90,7 +90,7 @@ DOWN = {"flags": "0x40040"}
         ({"mtu": "72"} | info(data_bittiming={"bitrate": 4000000}), FD, "can.bitrate", ERROR, "can.data_bitrate is 2000000"),
     ],
 )  # fmt: skip
-def test_what_is_not_as_it_should_be_is_reported_with_the_command(
+def test_a_wrong_setting_is_reported_with_the_command_that_corrects_it(
     tree: Tree, change: dict[str, Any], can: CanConfig, check: str, severity: str, said: str
 ) -> None:
     interface(tree, change)
@@ -101,7 +101,7 @@ def test_what_is_not_as_it_should_be_is_reported_with_the_command(
     assert grave(findings).keys() == (set() if severity == OK else {check}), "one cause, told once"
 
 
-def test_a_missing_interface_is_reported_with_those_there_are(tree: Tree) -> None:
+def test_a_missing_interface_is_reported_with_the_existing_ones(tree: Tree) -> None:
     found = only(check_can(tree, PLAIN), "can.exists")
     assert (found.severity, found.command) == (
         ERROR,
@@ -112,7 +112,7 @@ def test_a_missing_interface_is_reported_with_those_there_are(tree: Tree) -> Non
     assert only(check_can(tree, PLAIN), "can.exists").remedy == "Set can.channel: can1"
 
 
-def test_a_virtual_interface_is_noted_and_has_commands_of_its_own(tree: Tree) -> None:
+def test_a_virtual_interface_is_noted_and_has_its_own_commands(tree: Tree) -> None:
     change = DOWN | {"linkinfo": {"info_kind": "vcan"}}
     interface(tree, change)
     findings = check_can(tree, FD)
@@ -121,7 +121,7 @@ def test_a_virtual_interface_is_noted_and_has_commands_of_its_own(tree: Tree) ->
     assert only(findings, "can.fd").command.endswith("sudo ip link set can0 mtu 72 up")
 
 
-def test_vcan_gets_commands_of_its_own_also_without_ip(tree: Tree) -> None:
+def test_vcan_has_its_own_commands_even_without_ip(tree: Tree) -> None:
     add = "sudo ip link add vcan0 type vcan && sudo ip link set vcan0 up"
     assert only(check_can(tree, CanConfig(channel="vcan0")), "can.exists").command == add
     tree.file("/sys/class/net/can1/type", "280\n")
@@ -132,14 +132,14 @@ def test_vcan_gets_commands_of_its_own_also_without_ip(tree: Tree) -> None:
     assert only(found, "can.up").command == "sudo ip link set vcan0 up"
 
 
-def test_what_is_no_can_interface_and_no_driver_is_reported(tree: Tree) -> None:
+def test_a_missing_can_driver_and_another_kind_of_interface_are_reported(tree: Tree) -> None:
     interface(tree, {"type": "1"})
     found = only(check_can(tree, PLAIN), "can.exists")
     assert (found.severity, found.text) == (ERROR, "can0 is not a CAN interface")
     assert grave(check_can(tree, CanConfig(interface="pcan"))) == {"can.driver": NOTE}
 
 
-def test_slcan_cannot_restart_and_is_not_asked_to(tree: Tree) -> None:
+def test_slcan_is_not_asked_for_a_restart_that_it_cannot_do(tree: Tree) -> None:
     """The kernel's slcan driver: fixed rates, no bit timing, no restart."""
     rates = {"bittiming_bitrate": 500000, "bitrate_const": [250000, 500000]}
     change = info(bittiming=None, restart_ms=0, clock=0, **rates)
@@ -155,9 +155,7 @@ def test_slcan_cannot_restart_and_is_not_asked_to(tree: Tree) -> None:
 
 
 @pytest.mark.parametrize("shown", [None, "[]", "Device does not exist."])
-def test_without_ip_or_with_one_that_knows_no_json_the_rest_is_checked(
-    tree: Tree, shown: str | None
-) -> None:
+def test_without_ip_or_its_json_the_rest_is_checked(tree: Tree, shown: str | None) -> None:
     interface(tree, DOWN)
     del tree.programs["ip",]
     if shown is not None:

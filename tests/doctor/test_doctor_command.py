@@ -45,7 +45,7 @@ def document(file: Path, code: int) -> tuple[list[dict[str, str]], list[dict[str
     return found["findings"], [f for f in found["findings"] if f["severity"] == "error"]
 
 
-def test_a_usable_set_up_has_exit_code_0_and_plain_text_in_a_pipe(
+def test_a_usable_setup_has_exit_code_0_and_plain_text_in_a_pipe(
     tmp_path: Path, esc: PtyEsc
 ) -> None:
     done = run("doctor", "-c", configuration(tmp_path, esc.path))
@@ -70,7 +70,7 @@ def test_a_usable_set_up_has_exit_code_0_and_plain_text_in_a_pipe(
         ),
     ],
 )  # fmt: skip
-def test_an_error_has_its_exit_code_and_the_rest_is_looked_at_all_the_same(
+def test_an_error_has_its_exit_code_and_the_rest_is_still_checked(
     more: str, port: str, code: int, checks: list[str], said: str, tmp_path: Path, esc: PtyEsc
 ) -> None:
     written(tmp_path / "afile", "")
@@ -81,21 +81,21 @@ def test_an_error_has_its_exit_code_and_the_rest_is_looked_at_all_the_same(
     assert ("Serial port of esc1" in {f["group"] for f in findings}) == ("cann" not in more)
 
 
-def test_nothing_is_made_or_changed(tmp_path: Path, esc: PtyEsc) -> None:
+def test_doctor_creates_and_changes_nothing(tmp_path: Path, esc: PtyEsc) -> None:
     more = '[canopen]\nenabled = true\nstore = "not/yet"\n[record]\ndirectory = "captures"\nmin_free_mb = 0'
     findings, _ = document(configuration(tmp_path, esc.path, more), 0)
     assert sum(f["text"].endswith(", will be made") for f in findings) == 2
     assert [p.name for p in tmp_path.iterdir()] == ["gateway.toml"]
 
 
-def test_no_module_of_doctor_opens_a_device() -> None:
+def test_modules_of_doctor_do_not_open_a_device() -> None:
     for path in Path(ports.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             name = getattr(node, "attr", getattr(node, "id", ""))
             assert not name.startswith(("open", "write", "O_", "tcset")) or name == "openers"
 
 
-def test_why_the_gateway_hears_no_telemetry_is_a_warning(tmp_path: Path, esc: PtyEsc) -> None:
+def test_the_reason_for_missing_telemetry_is_a_warning(tmp_path: Path, esc: PtyEsc) -> None:
     file = configuration(tmp_path, esc.path, '[statistics]\nfile = "status.json"')
     why = "live frames of 38 bytes whose CRC covers 34 bytes instead of 32"
 

@@ -42,7 +42,7 @@ def service(tree: Tree) -> list[Finding]:
         ({"User": "bob"}, "user", NOTE, f"sudo -u bob kontronik-can-gw doctor -c {CONFIG}"),
     ],
 )
-def test_how_the_service_fares_is_reported(
+def test_the_state_of_the_service_is_reported(
     tree: Tree, shown: dict[str, str], check: str, severity: str, word: str
 ) -> None:
     tree.systemd(**shown)
@@ -54,7 +54,7 @@ def test_how_the_service_fares_is_reported(
 
 
 @pytest.mark.parametrize("folder", ["/usr/lib/systemd/system", "/etc/systemd/system"])
-def test_without_a_running_systemd_no_installation_is_advised(tree: Tree, folder: str) -> None:
+def test_without_systemd_an_installation_is_not_advised(tree: Tree, folder: str) -> None:
     found = only(service(tree), "machine.service")
     assert (found.severity, found.command) == (NOTE, f"kontronik-can-gw run --wait -c {CONFIG}")
     tree.file(f"{folder}/kontronik-can-gw.service", "")
@@ -81,7 +81,7 @@ def test_without_a_running_systemd_no_installation_is_advised(tree: Tree, folder
         ("/var/lib", ROOM, "of a gateway", NOTE, "perhaps the running gateway may"),
     ],
 )
-def test_a_folder_must_be_one_that_this_user_or_systemd_can_fill(
+def test_a_folder_must_be_writable_by_this_user_or_systemd(
     tree: Tree, there: str, space: tuple[bool, int], who: str, severity: str, said: str
 ) -> None:
     tree.folder(there)
@@ -99,7 +99,7 @@ def test_a_folder_must_be_one_that_this_user_or_systemd_can_fill(
 # --- the real thing
 
 
-def test_who_has_a_terminal_open_is_seen() -> None:
+def test_a_program_that_has_the_terminal_open_is_found() -> None:
     master, slave = os.openpty()
     status = Machine().status(os.ttyname(slave))
     assert status is not None
@@ -113,7 +113,7 @@ def test_who_has_a_terminal_open_is_seen() -> None:
     os.close(slave)
 
 
-def test_the_real_machine_is_looked_at_without_an_exception() -> None:
+def test_the_real_machine_is_checked_without_an_exception() -> None:
     machine = Machine()
     assert machine.processes
     assert machine.space("/proc")

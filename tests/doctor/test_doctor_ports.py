@@ -89,7 +89,7 @@ INSTALLED = methodcaller(
         ([MINI_UART], S0, "port.parity", ERROR, "dtoverlay=disable-bt"),
     ],
 )  # fmt: skip
-def test_what_is_found_is_reported(
+def test_findings_at_a_port_are_reported(
     tree: Tree, given: list[Set], port: str, name: str, severity: str, said: str
 ) -> None:
     for each in given:
@@ -108,7 +108,7 @@ def test_what_is_found_is_reported(
         ([FTDI, methodcaller("file", "/sys/class/tty/console/active", "ttyUSB01 tty0\n")], BY_ID),
     ],
 )
-def test_a_good_port_has_nothing_but_ok(tree: Tree, given: list[Set], port: str) -> None:
+def test_a_good_port_has_only_results_that_are_ok(tree: Tree, given: list[Set], port: str) -> None:
     for each in (*given, root):
         each(tree)
     findings = check_port(tree, "esc1", port, even_parity=True)

@@ -27,7 +27,7 @@ def minute(tmp_path_factory: pytest.TempPathFactory) -> Minute:
     return Minute(tmp_path_factory.mktemp("minute"))
 
 
-def test_the_minute_has_everything_in_it(minute: Minute) -> None:
+def test_the_minute_contains_every_kind_of_event(minute: Minute) -> None:
     """What can go wrong is there: losses, a lost port, a swapped device, errors, a return of each."""
     rows = minute.truth.columns()
     assert 4500 < len(minute.truth.row_ns) < 6000
@@ -41,7 +41,7 @@ def test_the_minute_has_everything_in_it(minute: Minute) -> None:
     assert np.isnan(rows["battery_voltage"]).sum() == 4  # a row for each loss
 
 
-def test_it_reads_back_equal(minute: Minute) -> None:
+def test_every_file_of_the_minute_reads_back_equal(minute: Minute) -> None:
     assert {name: one.problems for name, one in minute.verdicts.items() if one.problems} == {}
     assert len(minute.verdicts) == 5 + 2 * len(LOGS)
     frames, rows = 2 * len(minute.truth.sent_ns), 90 * len(minute.truth.row_ns)
@@ -77,7 +77,7 @@ FAULTS: tuple[tuple[str, str, Edit], ...] = (
 
 
 @pytest.mark.parametrize(("file", "what", "edit"), FAULTS, ids=lambda given: str(given)[:12])
-def test_a_mutilated_file_is_found_out(
+def test_a_falsified_file_is_detected(
     file: str, what: str, edit: Edit, minute: Minute, tmp_path: Path
 ) -> None:
     lines = (minute.folder / file).read_text().splitlines(keepends=True)

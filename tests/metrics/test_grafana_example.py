@@ -90,7 +90,7 @@ def prometheus(tmp_path: Path) -> Iterator[Prometheus]:
     metrics.end()
 
 
-def test_every_expression_finds_something(prometheus: Prometheus) -> None:
+def test_every_expression_returns_data(prometheus: Prometheus) -> None:
     for expression in EXPRESSIONS:
         wait_for(lambda e=expression: prometheus.find(e), expression)  # type: ignore[misc]
     for expression in ALARMS.values():
@@ -100,7 +100,7 @@ def test_every_expression_finds_something(prometheus: Prometheus) -> None:
     assert prometheus.find(ALARMS["EscNotHeard"]) == []
 
 
-def test_promtool_finds_nothing_wrong() -> None:
+def test_promtool_accepts_the_examples() -> None:
     if shutil.which("promtool") is None:
         pytest.skip("there is no promtool: sudo apt-get install prometheus")
     subprocess.run(["promtool", "check", "rules", FOLDER / "alerts.yml"], check=True)

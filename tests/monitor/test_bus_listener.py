@@ -46,7 +46,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return made
 
 
-def test_it_is_tried_at_most_each_half_second(
+def test_a_missing_interface_is_tried_at_most_each_half_second(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     listener = BusListener(CanConfig("pcan", "PCAN_USBBUS1"), frozenset({0x123}))
@@ -65,7 +65,7 @@ def test_it_is_tried_at_most_each_half_second(
     assert all(later - earlier >= 0.5 for earlier, later in itertools.pairwise(looked))
 
 
-def test_bus_off_is_reported_until_a_frame_comes(clock: Clock) -> None:
+def test_bus_off_is_reported_until_a_frame_is_received(clock: Clock) -> None:
     listener = BusListener(CanConfig(), frozenset({0x123}))
     (port,) = FakePort.opened
     port.state = CanState.BUS_OFF

@@ -58,7 +58,7 @@ def terminal(tmp_path: Path) -> Iterator[Terminal]:
     made.tmux("kill-server")
 
 
-def test_values_move_and_keys_are_obeyed(terminal: Terminal, tmp_path: Path) -> None:
+def test_values_change_and_keys_work_in_a_terminal(terminal: Terminal, tmp_path: Path) -> None:
     names = [f"esc{number}" for number in range(1, 9)]
     frames = flight(layout_of(names), 30, [with_errors(OperatingError.UNDERVOLTAGE)])
     log = write_log(tmp_path / "8.log", frames)

@@ -47,7 +47,7 @@ FRAME = st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.booleans
 
 @given(st.lists(VALUE, min_size=1, max_size=30))
 @settings(max_examples=50, deadline=None)
-def test_extremes_and_availability_hold_for_any_values(values: list[int | None]) -> None:
+def test_extremes_and_availability_are_right_for_any_values(values: list[int | None]) -> None:
     """Frames packed by cantools; None is sent as NotAvailable."""
     message = ONE.database.get_message_by_name("EscCurrent")
     monitor = Monitor(ONE)
@@ -71,7 +71,7 @@ def test_extremes_and_availability_hold_for_any_values(values: list[int | None])
 
 @given(st.lists(FRAME, max_size=40), st.data())
 @settings(max_examples=50, deadline=None)
-def test_any_frames_are_borne(
+def test_any_frames_are_accepted_without_an_exception(
     frames: Sequence[tuple[int, bytes, bool]], data: st.DataObject
 ) -> None:
     """Foreign ids, short data, any bits; times that jump."""
@@ -91,7 +91,7 @@ def test_any_frames_are_borne(
                 assert len(track.history) <= HISTORY_S
 
 
-def test_nothing_old_is_shown_when_frames_stay_away() -> None:
+def test_old_values_are_not_shown_after_the_last_frame() -> None:
     frames = flight(ONE, 2)
     monitor = watched(ONE, frames)
     assert monitor.escs[0].number("battery_voltage") is not None
@@ -105,7 +105,7 @@ def test_nothing_old_is_shown_when_frames_stay_away() -> None:
     assert esc.tracks["battery_voltage"].high is not None, "extremes stay"
 
 
-def test_the_history_has_a_value_each_second_and_none_while_it_is_not_available() -> None:
+def test_the_history_has_a_value_for_each_second_with_data() -> None:
     """The line is silent from 3.5 s on; the values end with the time-out of telemetry."""
     monitor = watched(ONE, flight(ONE, 6, until=3.5), 7.05)
     history = list(monitor.escs[0].tracks["battery_voltage"].history)
@@ -116,7 +116,7 @@ def test_the_history_has_a_value_each_second_and_none_while_it_is_not_available(
     assert list(monitor.escs[0].tracks["battery_voltage"].history) == [None] * HISTORY_S
 
 
-def test_a_link_is_not_lost_beside_a_value_because_its_message_comes_later() -> None:
+def test_a_link_is_not_lost_because_its_message_is_received_later() -> None:
     """Of the link's messages one was on its way when the values came, and the next comes a cycle later."""
     frames = flight(ONE, 3, until=1)
     (esc,) = watched(ONE, frames).escs
@@ -130,7 +130,7 @@ def test_a_link_is_not_lost_beside_a_value_because_its_message_comes_later() -> 
     assert normalize(esc.link or "") == "ok"
 
 
-def test_errors_have_their_meaning_and_come_first() -> None:
+def test_errors_are_shown_first_and_with_their_meaning() -> None:
     bits = (
         OperatingError.POWER_STAGE_OVERTEMP_WARNING,
         OperatingError.UNDERVOLTAGE,

@@ -51,7 +51,7 @@ def document(done: Done) -> dict[str, Any]:
     return found
 
 
-def test_nothing_in_the_monitor_can_send() -> None:
+def test_the_monitor_has_no_code_that_sends() -> None:
     """The way to the bus has no method to send with, and its sources call none."""
     assert not [name for name in dir(bus_listener.BusListener) if "send" in name]
     for module in (monitor, member, model, screen, sources, watch, bus_listener):
@@ -77,7 +77,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_log(tmp_path_factory.mktemp("logs") / "flight.log", flight(ONE, 12))
 
 
-def test_once_of_a_log_shows_what_holds_at_its_end(log: Path) -> None:
+def test_once_shows_the_values_at_the_end_of_a_log(log: Path) -> None:
     found = document(run("monitor", log, "--once"))
     frames = flight(ONE, 12)
     assert (found["file"], found["frames"]) == ("flight.log", len(frames))
@@ -90,7 +90,7 @@ def test_once_of_a_log_shows_what_holds_at_its_end(log: Path) -> None:
     assert found["time"].startswith("2026-09-21T")
 
 
-def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) -> None:
+def test_a_capture_is_shown_with_its_own_dbc(tmp_path: Path, clock: Clock) -> None:
     bench = Bench(*made(2)).live(3, 8, wild=False)
     file = written(tmp_path / "x.kcap", capture_file(bench.setup, bench.entries))
     found = document(run("monitor", file, "--once"))
@@ -105,7 +105,7 @@ def test_a_capture_is_watched_through_its_own_dbc(tmp_path: Path, clock: Clock) 
     assert "x.kcap: is a capture, which holds its own DBC. Leave -c and --dbc out." in done.err
 
 
-def test_plain_bytes_of_a_uart_are_watched(tmp_path: Path) -> None:
+def test_plain_bytes_of_a_uart_are_shown(tmp_path: Path) -> None:
     sent = SimulatedEsc(seed=1).frames_until(9 * SECOND_NS)
     file = written(tmp_path / "bytes.bin", b"".join(one.wire for one in sent))
     found = document(run("monitor", file, "--once"))
@@ -115,7 +115,7 @@ def test_plain_bytes_of_a_uart_are_watched(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("speed", [0.5, 4])
-def test_a_recording_is_played_at_its_pace(log: Path, clock: Clock, speed: float) -> None:
+def test_a_recording_is_played_in_real_time(log: Path, clock: Clock, speed: float) -> None:
     late: list[float] = []
     with open_input(log) as opened:
         recording = Recording(opened, speed)
@@ -177,7 +177,7 @@ def test_stream_has_no_old_values_in_a_gap_of_a_recording(tmp_path: Path, clock:
     assert all(voltages[:3]) and set(voltages[5:59]) == {None} and all(voltages[60:])
 
 
-def test_stream_of_a_bus_leaves_out_the_seconds_that_it_missed() -> None:
+def test_stream_of_a_bus_leaves_out_missed_seconds() -> None:
     class HeldUp(sources.Source):
         clock = 0
 
@@ -195,7 +195,7 @@ def test_stream_of_a_bus_leaves_out_the_seconds_that_it_missed() -> None:
     assert [seconds_of(one) - START_S for one in found] == [1, 2, 3602, 7202]
 
 
-def test_stream_of_a_bus_goes_on_without_frames_and_gives_the_reason() -> None:
+def test_stream_of_a_bus_without_frames_gives_the_reason() -> None:
     class Silent(sources.Source):
         clock = 0
 
@@ -231,7 +231,7 @@ def test_stream_of_a_bus_goes_on_without_frames_and_gives_the_reason() -> None:
         ("missing.log", (), None),
     ],
 )
-def test_a_name_is_an_interface_or_a_recording(
+def test_a_name_may_be_an_interface_or_a_recording(
     name: str, words: tuple[str, ...], channel: str | None, log: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -259,7 +259,7 @@ def test_an_interface_is_named_once() -> None:
     assert "is for a recording" in refused(2, "monitor", "vcan7", "--speed", 2)
 
 
-def test_the_interface_of_the_command_line_comes_before_the_configurations(
+def test_the_interface_of_the_command_line_overrides_the_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     toml = written(tmp_path / "g.toml", '[can]\nchannel = "can3"\n[[esc]]\nport = "x"\n')

@@ -64,7 +64,7 @@ def texts(
     st.text("npa0129 x", max_size=5),
 )  # fmt: skip
 @settings(max_examples=30, deadline=None)
-def test_any_size_and_keys_are_borne(
+def test_any_size_and_any_keys_are_accepted(
     size: tuple[int, int], count: int, kind: str, keys: str
 ) -> None:
     monitor, page = seen(count, kind), 0
@@ -76,7 +76,7 @@ def test_any_size_and_keys_are_borne(
 
 
 @pytest.mark.parametrize(("count", "size"), [(1, (60, 20)), (2, (120, 40)), (8, (80, 24))])
-def test_what_matters_is_never_cut(size: tuple[int, int], count: int) -> None:
+def test_important_lines_are_never_cut_off(size: tuple[int, int], count: int) -> None:
     monitor = seen(count, "errors")
     lines = texts(monitor, size)
     whole = "\n".join(lines)
@@ -90,7 +90,7 @@ def test_what_matters_is_never_cut(size: tuple[int, int], count: int) -> None:
     assert "ERROR: BEC current too high" in whole
 
 
-def test_errors_stand_with_their_remedies_where_there_is_room() -> None:
+def test_errors_are_shown_with_their_remedies_if_there_is_room() -> None:
     monitor, first = seen(8, "errors"), "-> Stop soon. Charge or check"
     assert first in "\n".join(texts(monitor, (80, 40)))
     assert first in "\n".join(texts(monitor, (80, 24), page=1))
@@ -128,7 +128,7 @@ def test_a_sparkline_of_several_lines_has_eight_steps_in_each() -> None:
 
 
 @pytest.mark.parametrize("size", [(80, 24), (80, 50), (120, 60)])
-def test_charts_of_one_esc_use_the_height_that_there_is(size: tuple[int, int]) -> None:
+def test_charts_of_one_esc_use_the_available_height(size: tuple[int, int]) -> None:
     monitor = seen(1)
     lines = texts(monitor, size)
     labels = [i for i, text in enumerate(lines) if text.startswith(tuple(LABELS))]
@@ -139,7 +139,7 @@ def test_charts_of_one_esc_use_the_height_that_there_is(size: tuple[int, int]) -
     assert sorted(heights, reverse=True) == heights, "the most important ones are taller"
 
 
-def test_charts_keep_their_height_when_errors_come() -> None:
+def test_charts_keep_their_height_when_errors_appear() -> None:
     places = [
         [
             i
@@ -152,7 +152,9 @@ def test_charts_keep_their_height_when_errors_come() -> None:
 
 
 @pytest.mark.parametrize(("size", "lines"), [((80, 24), 1), ((80, 50), 4), ((120, 60), 5)])
-def test_histories_of_all_escs_are_below_their_table(size: tuple[int, int], lines: int) -> None:
+def test_the_histories_of_all_escs_are_shown_below_their_table(
+    size: tuple[int, int], lines: int
+) -> None:
     shown = texts(seen(2), size)
     places = [
         i for i, text in enumerate(shown) if re.match(r"esc[12] +(motor speed|power stage)", text)
@@ -167,7 +169,7 @@ def test_histories_of_all_escs_are_below_their_table(size: tuple[int, int], line
 
 
 @pytest.mark.parametrize("kind", ["good", "errors"])
-def test_long_names_do_not_push_out_the_charge(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_names_do_not_hide_the_charge(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor = seen(2, kind)
     names = ("left_front_m", "left_front_n")
     for esc, name in zip(monitor.escs, names, strict=True):
@@ -222,6 +224,6 @@ def test_a_name_with_control_characters_does_not_reach_the_terminal() -> None:
         ("replay", "REPLAY: "),
     ],
 )
-def test_what_is_not_live_is_said_to_be_so(kind: str, said: str) -> None:
+def test_a_screen_without_live_data_is_marked(kind: str, said: str) -> None:
     assert said in "\n".join(texts(seen(1, kind), (80, 24)))
     assert said not in "\n".join(texts(seen(1), (80, 24)))

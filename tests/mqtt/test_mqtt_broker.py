@@ -150,7 +150,7 @@ def turning(client: MqttClient, condition: Callable[[], object]) -> None:
     wait_for(holds, lambda: client.problem)
 
 
-def test_newest_message_of_a_topic_waits_and_lasting_ones_are_first(broker: Mosquitto) -> None:
+def test_only_the_newest_message_of_a_topic_waits_and_retained_go_first(broker: Mosquitto) -> None:
     client = MqttClient(to(broker.port), "test", ONLINE)
     for number in range(1000):
         client.offer(Publication("k/test/state", b"%d" % number))
@@ -224,7 +224,7 @@ def openssl(*words: object) -> None:
     subprocess.run(["openssl", *map(str, words)], check=True, capture_output=True)
 
 
-def test_tls_with_an_own_authority_and_with_wrong_certificates(tmp_path: Path) -> None:
+def test_tls_accepts_an_own_authority_and_refuses_wrong_certificates(tmp_path: Path) -> None:
     authority, secret = tmp_path / "authority.pem", tmp_path / "authority.key"
     new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
     openssl("req", "-x509", *new, "-subj", "/CN=authority", "-keyout", secret, "-out", authority)

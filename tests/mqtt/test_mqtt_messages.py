@@ -280,7 +280,7 @@ def test_every_entity_is_valid_and_shows_a_key_of_the_state() -> None:
     assert len(ids) == len(set(ids)) > 100
 
 
-def test_esc_is_announced_when_heard_and_again_when_identified() -> None:
+def test_an_esc_is_announced_when_heard_and_again_when_identified() -> None:
     bus = layout_of(["esc1"])
     columns = SignalReader(bus.layout).columns
     info = {c.key for c in columns if c.source in ("device", "firmware_main")}

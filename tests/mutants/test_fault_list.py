@@ -5,7 +5,7 @@ from put_in_faults import PROJECT, Fault, faults
 
 
 @pytest.mark.parametrize("fault", faults(), ids=lambda fault: fault.what)
-def test_a_fault_of_the_list_can_be_put_in(fault: Fault) -> None:
+def test_each_fault_of_the_list_can_be_put_in(fault: Fault) -> None:
     file, changed = fault.put_in()
     assert changed != file.read_text()
     assert all((PROJECT / tests).exists() for tests in fault.seen_by)

@@ -33,7 +33,7 @@ CONFIGURATIONS = sorted(EXAMPLES.glob("*/gateway.toml"))
 NEEDS = {"jq": "jq", "cc": "gcc libc6-dev"}
 
 
-def test_the_reference_is_that_of_the_sources() -> None:
+def test_the_reference_matches_the_sources() -> None:
     made = {FOLDER / name: text for name, text in pages()}
     found = {path: text for path, text in PAGES.items() if path.parent == FOLDER}
     assert made == found, "run: make docs"
@@ -70,7 +70,7 @@ def test_links_lead_to_files_and_headings() -> None:
             assert not anchor or anchor in anchors(PAGES[target]), f"{path.name}: {link}"
 
 
-def test_every_page_is_found_from_the_front() -> None:
+def test_every_page_can_be_reached_from_the_front_page() -> None:
     linked = {
         (path.parent / link).resolve()
         for path, text in PAGES.items()
@@ -93,23 +93,23 @@ def test_json_blocks_are_valid() -> None:
         json.loads(block.text)
 
 
-def test_every_command_is_named() -> None:
+def test_every_command_is_documented() -> None:
     assert all(f"`kontronik-can-gw {command}" in README for command in COMMANDS)
 
 
-def test_every_command_that_is_named_exists() -> None:
+def test_every_documented_command_exists() -> None:
     for command in re.findall(r"(?<!-u )kontronik-can-gw ([a-z]+)\b(?! gateway)", ALL):
         assert command in COMMANDS, command
 
 
-def test_every_make_target_that_is_named_exists() -> None:
+def test_every_documented_make_target_exists() -> None:
     makefile = (PROJECT / "Makefile").read_text(encoding="utf-8")
     for target in re.findall(r"`?make ([a-z]+)", ALL):
         if target not in ("an", "no", "sure"):
             assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
-def test_pictures_are_those_that_pages_show_small_and_need_no_server() -> None:
+def test_pictures_are_in_use_and_small_and_load_nothing() -> None:
     shown = {
         (path.parent / link).resolve()
         for path, text in PAGES.items()
@@ -123,7 +123,7 @@ def test_pictures_are_those_that_pages_show_small_and_need_no_server() -> None:
 
 
 @pytest.mark.extended
-def test_pictures_can_be_made_anew(tmp_path: Path) -> None:
+def test_pictures_can_be_made_again(tmp_path: Path) -> None:
     if PROGRAM is None:
         pytest.skip(MISSING)
     main(tmp_path)
@@ -135,7 +135,7 @@ def test_pictures_can_be_made_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.parent.name)
-def test_check_accepts_it_without_a_warning(file: Path) -> None:
+def test_check_accepts_each_example_without_a_warning(file: Path) -> None:
     done = run("check", file)
     assert (done.code, done.err) == (0, "")
 
@@ -144,7 +144,7 @@ def test_check_accepts_it_without_a_warning(file: Path) -> None:
     ("file", "words"),
     [("bus.dbc", []), ("canopen.dbc", ["--canopen"])],
 )
-def test_a_dbc_beside_it_is_what_the_command_writes(file: str, words: list[str]) -> None:
+def test_the_dbc_of_an_example_is_the_output_of_the_command(file: str, words: list[str]) -> None:
     for dbc in EXAMPLES.glob(f"*/{file}"):
         assert run("dbc", *words, "-c", dbc.with_name("gateway.toml")).data == dbc.read_bytes(), dbc
 
@@ -181,7 +181,9 @@ def given(block: Block) -> object:
 
 
 @pytest.mark.parametrize("block", [given(block) for block in blocks("")])
-def test_a_shell_block_can_be_typed_as_it_is(block: Block, files: Path, tmp_path: Path) -> None:
+def test_a_shell_block_can_be_typed_as_it_is_written(
+    block: Block, files: Path, tmp_path: Path
+) -> None:
     for program, package in NEEDS.items():
         if f"{program} -" in block.text and shutil.which(program) is None:
             pytest.skip(f"no {program}: sudo apt-get install {package}")
@@ -190,7 +192,7 @@ def test_a_shell_block_can_be_typed_as_it_is(block: Block, files: Path, tmp_path
     run_block(block, folder)
 
 
-def test_each_block_says_why_it_cannot_be_run() -> None:
+def test_each_block_states_why_it_cannot_be_run() -> None:
     assert {block.word for block in blocks()} <= set(WORDS)
     assert len(blocks()) == ALL.count("\n```sh")
     assert "```bash" not in ALL

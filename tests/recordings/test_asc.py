@@ -23,7 +23,7 @@ def _read(path: Path, *lines: str, base: str = "hex") -> list[tuple[int, CanFram
     return found
 
 
-def test_the_start_of_a_can_fd_measurement_is_no_frame(tmp_path: Path) -> None:
+def test_the_start_line_of_a_can_fd_measurement_is_not_a_frame(tmp_path: Path) -> None:
     path = tmp_path / "fd.asc"
     found = _read(
         path,
@@ -63,7 +63,7 @@ def test_the_id_of_a_symbolic_name_is_at_the_end_of_the_line(tmp_path: Path, bas
     ]
 
 
-def test_an_id_stays_an_id_when_the_line_repeats_it(tmp_path: Path) -> None:
+def test_an_id_is_read_once_when_the_line_repeats_it(tmp_path: Path) -> None:
     tail = "  Length = 230000 BitCount = 119 ID = "
     found = _read(
         tmp_path / "ids.asc",

@@ -25,7 +25,7 @@ WITH_FD = sorted(set(FORMATS) - {"trc"})
 
 
 @pytest.mark.parametrize("format_", FORMATS)
-def test_what_is_written_is_read_by_python_can_and_by_us(tmp_path: Path, format_: str) -> None:
+def test_a_written_log_is_read_equal_by_python_can_and_by_us(tmp_path: Path, format_: str) -> None:
     path = tmp_path / f"log{SUFFIX[format_]}"
     for seed in range(3 if format_ == "mf4" else 12):
         items = some_frames(100, seed, fd=format_ in WITH_FD)
@@ -39,7 +39,7 @@ def test_what_is_written_is_read_by_python_can_and_by_us(tmp_path: Path, format_
 
 
 @pytest.mark.parametrize("format_", FORMATS)
-def test_what_python_can_writes_is_read(tmp_path: Path, format_: str) -> None:
+def test_a_log_written_by_python_can_is_read(tmp_path: Path, format_: str) -> None:
     items = at_wall(some_frames(300, fd=format_ in WITH_FD))
     path = tmp_path / f"log{SUFFIX[format_]}"
     with can.Logger(path) as writer:
@@ -107,14 +107,14 @@ def test_asc_with_decimal_base_and_relative_times_is_read(tmp_path: Path) -> Non
     ]
 
 
-def test_the_content_tells_the_format_before_the_suffix(tmp_path: Path) -> None:
+def test_the_content_decides_on_the_format_and_not_the_suffix(tmp_path: Path) -> None:
     for format_ in FORMATS:
         path = tmp_path / f"{format_}.bin"
         write_log(path, format_, some_frames(5))
         assert log_format(path.read_bytes()) == format_
 
 
-def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:
+def test_can_fd_frames_are_left_out_of_trc_with_a_warning(tmp_path: Path) -> None:
     some, source = some_frames(100, fd=True), tmp_path / "fd.log"
     write_log(source, "candump", some)
     said = run("convert", source, tmp_path / "fd.trc").err
@@ -124,7 +124,7 @@ def test_trc_says_what_it_cannot_hold(tmp_path: Path) -> None:
     assert found == [item[1:] for item in some if not item[1].fd]
 
 
-def test_a_part_has_frames_that_a_log_of_two_interfaces_holds_late(tmp_path: Path) -> None:
+def test_a_part_has_all_frames_of_a_log_whose_interfaces_are_not_in_order(tmp_path: Path) -> None:
     """Those of the second interface stand up to a second behind their time."""
     lines = []
     for ms in range(0, 6000, 5):

@@ -87,7 +87,7 @@ def test_a_copy_of_a_log_keeps_the_channels(tmp_path: Path, format_: str) -> Non
     assert back.read_text().count("\n") == 50
 
 
-def test_the_only_channel_with_messages_of_the_dbc_is_taken(tmp_path: Path) -> None:
+def test_the_only_channel_with_messages_of_the_dbc_is_chosen(tmp_path: Path) -> None:
     log = _two_buses(tmp_path / "two.log")
     log.write_text(log.read_text().replace("can1 688", "can1 123"))
     assert _voltages(log) == {"25.0"}
@@ -101,7 +101,7 @@ def test_the_only_channel_with_messages_of_the_dbc_is_taken(tmp_path: Path) -> N
     )
 
 
-def test_all_channels_are_listed_also_those_that_come_later(tmp_path: Path) -> None:
+def test_all_channels_of_the_whole_log_are_listed(tmp_path: Path) -> None:
     log = _two_buses(tmp_path / "many.log")
     lines = log.read_text().splitlines(keepends=True)
     log.write_text("".join([*lines, "(1700000001.000000) vcan7 688#0000008813001400\n"]))
@@ -128,7 +128,7 @@ def test_a_capture_has_no_channels(tmp_path: Path) -> None:
         (["can0", "1"], [1, 2], ["can0", "can1"]),
     ],
 )
-def test_each_channel_gets_a_number_and_a_name_of_its_own(
+def test_each_channel_gets_a_unique_number_and_name(
     channels: list[str], numbers: list[int], names: list[str]
 ) -> None:
     of_numbers, of_names = Channels("own"), Channels("own")
@@ -137,7 +137,7 @@ def test_each_channel_gets_a_number_and_a_name_of_its_own(
         assert [of_names.name_of(channel) for channel in channels] == names
 
 
-def test_a_log_of_python_can_has_the_channels_of_its_tools(tmp_path: Path) -> None:
+def test_channels_of_logs_by_python_can_count_as_in_its_tools(tmp_path: Path) -> None:
     """python-can counts from 0, where ASC, BLF and the tools of their makers count from 1."""
     data = bytes.fromhex("000000C409001400")
     for suffix, name in ((".asc", "2"), (".blf", "2"), (".trc", "2"), (".mf4", "1")):

@@ -83,7 +83,7 @@ def _with_clock_set_back(log: Path, path: Path) -> Path:
     return path
 
 
-def test_tables_reports_and_logs_are_those_of_a_steady_clock(tmp_path: Path) -> None:
+def test_tables_reports_and_logs_are_as_with_a_steady_clock(tmp_path: Path) -> None:
     even = candump_log(tmp_path / "even.log")
     back = _with_clock_set_back(even, tmp_path / "back.log")
     note = f"{back}: {SET_BACK.format('1.5')}"
@@ -165,7 +165,7 @@ def test_the_gap_at_a_step_is_taken_from_the_periods_of_the_ids() -> None:
 
 
 @pytest.mark.parametrize("ahead_ms", [3000, 40_000])
-def test_one_frame_ahead_of_the_others_is_no_step(ahead_ms: int) -> None:
+def test_one_frame_ahead_of_the_others_is_not_a_step(ahead_ms: int) -> None:
     times = [*range(500), 500 + ahead_ms, *range(501, 1000)]
     found, clock = _read(times)
     assert clock.steps == []

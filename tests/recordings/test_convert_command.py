@@ -36,7 +36,7 @@ def dump(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "candump", "blf", "mf4-log"])
-def test_nothing_to_convert_leaves_nothing(tmp_path: Path, form: str) -> None:
+def test_an_input_without_frames_is_refused_and_leaves_no_file(tmp_path: Path, form: str) -> None:
     source, is_table = tmp_path / "other.log", form in ("csv", "jsonl", "parquet")
     empty = "base hex  timestamps absolute\n"
     source.write_text("(1700000000.000000) can0 123#00\n" if is_table else empty)
@@ -63,7 +63,9 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "asc", "blf", "mf4-log"])
-def test_a_full_disk_is_one_line_and_leaves_nothing(dump: Path, tmp_path: Path, form: str) -> None:
+def test_a_full_disk_is_reported_in_one_line_and_leaves_no_file(
+    dump: Path, tmp_path: Path, form: str
+) -> None:
     def small() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
 
@@ -79,7 +81,9 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(dump: Path, tmp_path: Path, 
     ("form", "number"),
     [("csv", signal.SIGINT), ("parquet", signal.SIGTERM), ("blf", signal.SIGINT)],
 )
-def test_a_signal_leaves_no_half_file(tmp_path: Path, form: str, number: signal.Signals) -> None:
+def test_a_signal_leaves_no_incomplete_file(
+    tmp_path: Path, form: str, number: signal.Signals
+) -> None:
     # far more than is done before the signal comes
     source = candump_log(tmp_path / "long.log", 100)
     process = subprocess.Popen(
@@ -94,7 +98,7 @@ def test_a_signal_leaves_no_half_file(tmp_path: Path, form: str, number: signal.
     assert [path.name for path in tmp_path.iterdir()] == ["long.log"]
 
 
-def test_a_long_conversion_counts_what_is_done_on_a_terminal(
+def test_a_long_conversion_shows_its_progress_on_a_terminal(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("TERM", "xterm")

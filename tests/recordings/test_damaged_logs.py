@@ -32,9 +32,7 @@ def _is_part(found: list[Item], items: list[Item]) -> bool:
 
 
 @pytest.mark.parametrize("format_", OWN)
-def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(
-    tmp_path: Path, format_: str
-) -> None:
+def test_a_cut_file_gives_all_frames_before_the_cut(tmp_path: Path, format_: str) -> None:
     path, items, content = _log(tmp_path, format_, 8)
     others = content.count(b"\n") - len(items) - (format_ == "asc")
     for cut in range(len(content)):
@@ -56,7 +54,7 @@ def test_a_file_that_is_cut_anywhere_gives_what_is_before_the_cut(
 @pytest.mark.parametrize(
     "rubbish", [b"\0" * 10_000, b"hello\n", bytes(range(256)) * 3 + b"\n", b"\n\n", b"(1.5) \n"]
 )
-def test_rubbish_between_lines_costs_no_frame(tmp_path: Path, format_: str, rubbish: bytes) -> None:
+def test_rubbish_between_lines_loses_no_frame(tmp_path: Path, format_: str, rubbish: bytes) -> None:
     path, items, content = _log(tmp_path, format_, 40)
     at = content.index(b"\n", len(content) // 2) + 1
     path.write_bytes(content[:at] + rubbish + content[at:])
@@ -79,7 +77,7 @@ def test_rubbish_between_lines_costs_no_frame(tmp_path: Path, format_: str, rubb
         ),
     ],
 )  # fmt: skip
-def test_of_a_damaged_blf_file_the_frames_before_the_damage_are_read(
+def test_frames_before_the_damage_of_a_blf_file_are_read(
     tmp_path: Path, place: int, bits: bytes, lost: slice, told: str
 ) -> None:
     """python-can alone reads an object of size 0 for ever, and takes a DLC of 16 for a frame."""
@@ -102,7 +100,7 @@ def test_of_a_damaged_blf_file_the_frames_before_the_damage_are_read(
 
 
 @pytest.mark.parametrize("format_", [*OWN, "mf4"])
-def test_no_damage_raises_anything_else(tmp_path: Path, format_: str) -> None:
+def test_no_damage_raises_anything_but_a_user_error(tmp_path: Path, format_: str) -> None:
     path, _, content = _log(tmp_path, format_, 40)
     chance = random.Random(7)
     for _ in range(15 if format_ == "mf4" else 200):
@@ -130,7 +128,7 @@ def test_no_damage_raises_anything_else(tmp_path: Path, format_: str) -> None:
     ],
     ids=["damaged times are left out", "a clock that was set leaves nothing out"],
 )
-def test_a_time_far_away_is_believed_where_the_next_one_agrees(
+def test_a_time_far_away_is_accepted_if_the_next_time_agrees(
     tmp_path: Path, moved: dict[int, int], lost: list[int]
 ) -> None:
     """``moved``: by how many days."""
@@ -145,7 +143,7 @@ def test_a_time_far_away_is_believed_where_the_next_one_agrees(
 
 
 @pytest.mark.parametrize("size", [15, 0x7FFFFFFF, 0xFFFFFFFF])
-def test_a_container_of_an_impossible_size_is_damage(tmp_path: Path, size: int) -> None:
+def test_a_container_of_an_impossible_size_is_reported_as_damage(tmp_path: Path, size: int) -> None:
     """python-can takes all the rest for it, of which it unpacks the first."""
     items = at_wall(some_frames(9_000))
     path = tmp_path / "log.blf"
@@ -172,7 +170,7 @@ TRC = ";$FILEVERSION={}\n;$STARTTIME=45244.0\n;$COLUMNS=N,O,T,I,d,L,D\n{}\n"
         "2 2.0 FD 0123 Rx 9 " + "11 " * 9,
     ],
 )
-def test_a_line_of_trc_whose_time_or_length_cannot_be_is_damaged(tmp_path: Path, line: str) -> None:
+def test_a_trc_line_with_an_impossible_time_or_length_is_damaged(tmp_path: Path, line: str) -> None:
     path = tmp_path / "log.trc"
     lines = "1 1.0 DT 0123 Rx 1 11", line, "3 3.0 FD 0124 Rx 15 " + "22 " * 64
     path.write_text(TRC.format("2.1", "\n".join(lines)))
@@ -184,7 +182,7 @@ def test_a_line_of_trc_whose_time_or_length_cannot_be_is_damaged(tmp_path: Path,
 @pytest.mark.parametrize(
     ("version", "count", "damage"), [("1.0", 2, []), ("1.2", 0, ["its file version is not known"])]
 )
-def test_trc_of_version_1_0_is_read_where_it_says_so(
+def test_trc_of_version_1_0_is_read_if_its_header_names_the_version(
     tmp_path: Path, version: str, count: int, damage: list[str]
 ) -> None:
     path = tmp_path / "log.trc"

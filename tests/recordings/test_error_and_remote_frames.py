@@ -39,7 +39,9 @@ def _kinds(found: list[LogFrame]) -> list[tuple[str, int, bytes]]:
 
 
 @pytest.mark.parametrize("format_", sorted(READERS))
-def test_they_are_written_and_read_again(tmp_path: Path, format_: str) -> None:
+def test_error_and_remote_frames_are_read_back_as_they_were_written(
+    tmp_path: Path, format_: str
+) -> None:
     items = [LogFrame(n * MS, frame, n % 3 > 0, "can0") for n, frame in enumerate(FRAMES)]
     path = tmp_path / f"log{SUFFIX[format_]}"
     with path.open("wb") as file:
@@ -62,7 +64,7 @@ def test_they_are_written_and_read_again(tmp_path: Path, format_: str) -> None:
     assert kinds == [(item.frame is NO_ACK, item.frame.remote) for item in expected]
 
 
-def test_tables_reports_and_screens_count_them(tmp_path: Path) -> None:
+def test_tables_reports_and_screens_count_error_and_remote_frames(tmp_path: Path) -> None:
     log = candump_log(tmp_path / "flight.log")
     lines = log.read_text().splitlines(keepends=True)
     plain = run("convert", "-q", log, "-", "--to", "csv").out
@@ -90,7 +92,7 @@ def test_tables_reports_and_screens_count_them(tmp_path: Path) -> None:
     assert copied == [line.split()[:3] for line in lines]
 
 
-def test_those_of_another_channel_are_not_counted(tmp_path: Path) -> None:
+def test_error_and_remote_frames_of_another_channel_are_not_counted(tmp_path: Path) -> None:
     log = tmp_path / "two.log"
     log.write_text(
         "(1700000000.000000) can0 20000004#0004000000000000\n"
@@ -103,7 +105,7 @@ def test_those_of_another_channel_are_not_counted(tmp_path: Path) -> None:
     assert f"{log}: 1 error frame left out\n" in done.err
 
 
-def test_lines_of_asc_with_them_are_read(tmp_path: Path) -> None:
+def test_asc_lines_with_error_and_remote_frames_are_read(tmp_path: Path) -> None:
     path = tmp_path / "log.asc"
     path.write_text(
         "date Wed Nov 15 10:13:20.250 am 2023\n"
@@ -175,7 +177,7 @@ def test_error_objects_of_blf_that_python_can_skips_are_read(tmp_path: Path, kin
     ]
 
 
-def test_remote_frames_that_a_gateway_received_are_remote_frames_in_a_log(tmp_path: Path) -> None:
+def test_remote_frames_of_a_capture_are_remote_frames_in_a_log(tmp_path: Path) -> None:
     bench = Bench(*made()).live(3, 0.5)
     entries = list(bench.entries)
     now = entries[40].time_ns

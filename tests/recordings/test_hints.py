@@ -9,7 +9,7 @@ from command_line import refused, run
 from simulated_bus import flight, layout_of, write_log
 
 
-def test_frames_that_the_dbc_does_not_have_are_counted_and_the_remedy_is_said(
+def test_frames_missing_in_the_dbc_are_counted_and_a_remedy_is_named(
     tmp_path: Path,
 ) -> None:
     log = write_log(tmp_path / "bus.log", flight(layout_of(["a", "b", "c"]), 2))
@@ -25,7 +25,7 @@ def test_frames_that_the_dbc_does_not_have_are_counted_and_the_remedy_is_said(
     assert "left out" not in run("convert", log, tmp_path / "o.blf").err, "which holds all of them"
 
 
-def test_a_table_in_mf4_is_told_from_a_log(tmp_path: Path) -> None:
+def test_a_table_in_mf4_is_distinguished_from_a_log(tmp_path: Path) -> None:
     table = tmp_path / "table.mf4"
     values = np.array([1.0, 2.0])
     with asammdf.MDF() as mdf:
@@ -46,7 +46,9 @@ def test_a_table_in_mf4_is_told_from_a_log(tmp_path: Path) -> None:
         "  vcan0  688   [0] ",
     ],
 )
-def test_the_screen_output_of_candump_gets_the_right_command(tmp_path: Path, line: str) -> None:
+def test_candumps_screen_output_is_refused_with_the_right_command(
+    tmp_path: Path, line: str
+) -> None:
     log = tmp_path / "screen.txt"
     log.write_text(f"{line}\n" * 3)
     for words in (

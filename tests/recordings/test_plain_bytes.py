@@ -44,7 +44,7 @@ def assumed_times(found: list[Found]) -> list[int]:
 
 @pytest.mark.parametrize("kind", list(STREAMS))
 @pytest.mark.parametrize("seed", range(6))
-def test_rows_are_the_frames_that_brute_force_finds(
+def test_rows_are_exactly_the_frames_found_by_brute_force(
     tmp_path: Path, kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However the file is read: small reads put every limit of a read anywhere in a frame and in rubbish."""
@@ -84,7 +84,7 @@ def test_rows_are_the_frames_that_brute_force_finds(
 @pytest.mark.parametrize(
     ("start", "end"), [("3.3", "9"), ("0", "0"), (None, "7.7"), ("12", None), ("8", "8.001")]
 )
-def test_a_part_of_the_frames_of_plain_bytes_is_cut_out_of_all(
+def test_a_part_of_plain_bytes_has_the_frames_of_the_whole_at_its_times(
     tmp_path: Path, start: str | None, end: str | None
 ) -> None:
     source = tmp_path / "esc.bin"

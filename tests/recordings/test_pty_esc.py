@@ -29,7 +29,7 @@ def read_exactly(path: str | Path, size: int) -> bytes:
         os.close(fd)
 
 
-def test_every_byte_value_passes_and_an_echo_that_the_gateway_switched_on_is_noticed(
+def test_every_byte_passes_and_an_echo_is_noticed(
     esc: PtyEsc,
 ) -> None:
     assert esc.write(ALL_BYTES)
@@ -45,7 +45,7 @@ def test_every_byte_value_passes_and_an_echo_that_the_gateway_switched_on_is_not
     assert esc.check() == esc.received == 4
 
 
-def test_what_nobody_reads_is_dropped_and_counted_and_never_blocks(esc: PtyEsc) -> None:
+def test_unread_bytes_are_dropped_and_counted_and_never_block(esc: PtyEsc) -> None:
     written = refused = 0
     while refused < 20:
         # the kernel moves bytes between its buffers meanwhile, so some may be taken after a refusal
@@ -58,7 +58,7 @@ def test_what_nobody_reads_is_dropped_and_counted_and_never_blocks(esc: PtyEsc) 
     assert read_exactly(esc.path, 5) == b"again"
 
 
-def test_a_link_is_replaced_leads_to_the_terminal_and_goes_with_it_unless_another_took_it(
+def test_a_link_leads_to_its_terminal_and_is_removed_with_it(
     tmp_path: Path,
 ) -> None:
     link = tmp_path / "esc1"

@@ -78,7 +78,7 @@ def rows_of(source: Path) -> list[bytes]:
     return target.read_bytes().splitlines()
 
 
-def test_rows_of_candump_appear_while_the_stream_goes_on(tmp_path: Path) -> None:
+def test_rows_of_candump_appear_before_the_stream_ends(tmp_path: Path) -> None:
     lines = candump_lines(tmp_path)
     expected = rows_of(tmp_path / "whole.log")
     with started("convert", "-", "-", "--to", "csv") as process:
@@ -179,7 +179,7 @@ def _is_waiting_with_rows(target: Path) -> bool:
     return part.exists() and part.stat().st_size > 0
 
 
-def test_a_signal_before_any_row_leaves_nothing(tmp_path: Path) -> None:
+def test_a_signal_before_any_row_leaves_no_file(tmp_path: Path) -> None:
     line = candump_lines(tmp_path)[0]
     with started("convert", "-", "-", "--to", "candump") as process:
         send(process, line + line)
@@ -292,7 +292,7 @@ def test_a_page_of_a_pipe_has_the_data_of_the_file(tmp_path: Path, kind: str) ->
     assert "<title>standard input</title>" in (tmp_path / "pipe.html").read_text()
 
 
-def test_the_monitor_shows_a_stream_that_goes_on(tmp_path: Path) -> None:
+def test_the_monitor_shows_a_stream_before_it_ends(tmp_path: Path) -> None:
     """After its frames have stopped, the values expire although the stream has not ended."""
     with started("monitor", "-") as process:
         send(process, b"".join(candump_lines(tmp_path)))
@@ -329,7 +329,7 @@ def piped() -> Iterator[tuple[Stream, Callable[[bytes], int]]]:
         os.close(writes)
 
 
-def test_a_read_returns_what_is_there_and_reports_each_wait() -> None:
+def test_a_read_returns_the_waiting_bytes_and_reports_each_wait() -> None:
     waits: list[str] = []
     with piped() as (stream, write):
         reader = StreamReader(stream)
@@ -349,7 +349,7 @@ def test_a_read_returns_what_is_there_and_reports_each_wait() -> None:
         assert waits == ["wait"]
 
 
-def test_an_ended_stream_gives_what_is_in_the_pipe_without_a_cut_line() -> None:
+def test_an_ended_stream_gives_the_rest_of_the_pipe_without_a_cut_line() -> None:
     with piped() as (stream, write):
         reader = StreamReader(stream)
         write(b"first\nsecond\nthi")
@@ -364,7 +364,7 @@ def test_a_waiting_read_is_ended() -> None:
         assert StreamReader(stream).read1(10) == b""
 
 
-def test_the_head_that_was_looked_at_is_read_again() -> None:
+def test_the_inspected_head_is_read_again() -> None:
     with piped() as (stream, write):
         write(b"head")
         assert stream.look()

@@ -81,7 +81,7 @@ def with_computed(data: pd.DataFrame, source: str) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize("esc", [0, 1])
-def test_the_numbers_are_those_of_pandas(
+def test_the_numbers_equal_those_computed_by_pandas(
     bus: BusLayout, rows: list[Row], flight: Flight, esc: int
 ) -> None:
     sources = (
@@ -114,7 +114,7 @@ def test_the_numbers_are_those_of_pandas(
         assert (extreme.value, extreme.time_ns) == (values[at], data.time_ns.iloc[at]), source
 
 
-def test_errors_and_a_swapped_device_are_events_when_they_came(flight: Flight) -> None:
+def test_errors_and_a_swapped_device_are_events_at_their_times(flight: Flight) -> None:
     def of(text: str, esc: int = 0) -> list[Event]:
         return [e for e in flight.events if e.kind == "error" and e.text == text and e.esc == esc]
 
@@ -156,7 +156,7 @@ def test_losses_are_gaps_in_lines_and_events(
         assert all(v is None for v in inside[5:-5])
 
 
-def test_peak_power_of_a_log_is_that_of_its_voltage_and_current(tmp_path: Path) -> None:
+def test_the_peak_power_of_a_log_is_computed_from_voltage_and_current(tmp_path: Path) -> None:
     """The shipped DBC sends power every 100 ms, voltage and current with each telemetry frame."""
     bus = layout_of(["esc1"])
     times = range(0, S, S // 100)
@@ -195,7 +195,7 @@ def bus_file_with_power_in_each_frame(tmp_path: Path) -> Path:
     return file
 
 
-def test_many_events_and_states_stay_bounded() -> None:
+def test_many_events_and_states_need_bounded_memory() -> None:
     bus = layout_of(["esc1"])
     rows = rows_of(
         bus,
@@ -211,7 +211,7 @@ def test_many_events_and_states_stay_bounded() -> None:
 
 
 @pytest.mark.parametrize("points", [100, 20_000])
-def test_rows_far_apart_are_not_joined_even_without_a_row_that_shows_the_loss(points: int) -> None:
+def test_distant_rows_are_not_joined_even_without_a_row_for_the_loss(points: int) -> None:
     """As in a log that was stopped for a while: 2 s of rows, nothing for 1.1 s, and so on."""
     bus = layout_of(["esc1"])
     times = [part * 3_100_000_000 + at * 10_000_000 for part in range(40) for at in range(201)]

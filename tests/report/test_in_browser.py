@@ -132,7 +132,7 @@ def test_time_labels_are_whole_and_apart(
             assert left - right > 5, labels
 
 
-def test_one_line_of_the_speeds_is_drawn_and_the_cursor_shows_all(
+def test_one_speed_is_drawn_and_the_cursor_shows_all_speeds(
     browser: Browser, pages: dict[str, Path]
 ) -> None:
     browser.open(pages["one"])
@@ -173,7 +173,7 @@ def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Pa
         assert all((text != "–") == is_known for text in shown), (seconds, shown)
 
 
-def test_a_drag_zooms_all_plots_and_a_click_on_an_event_goes_there(
+def test_a_drag_zooms_all_plots_and_a_click_on_an_event_jumps_to_it(
     browser: Browser, pages: dict[str, Path]
 ) -> None:
     browser.open(pages["one"])

@@ -51,7 +51,7 @@ class Tags(HTMLParser):
             self.text += data
 
 
-def test_the_page_asks_for_nothing_and_its_policy_names_what_may_run(flight: Flight) -> None:
+def test_the_page_loads_nothing_and_its_policy_lists_its_scripts(flight: Flight) -> None:
     html = render(flight, source="y")
     tags = Tags(html)
     for tag, attributes in tags.found:
@@ -70,7 +70,7 @@ def test_the_page_asks_for_nothing_and_its_policy_names_what_may_run(flight: Fli
     assert "url(" not in html
 
 
-def test_everything_of_the_input_is_escaped(flight: Flight) -> None:
+def test_all_text_of_the_input_is_escaped(flight: Flight) -> None:
     flight = flown(3)
     flight.escs[0].name = EVIL
     flight.escs[0].devices = [EVIL]
@@ -88,7 +88,7 @@ def test_everything_of_the_input_is_escaped(flight: Flight) -> None:
     assert tags.found[title + 1][0] == "style"
 
 
-def test_the_data_in_the_page_are_those_of_the_lines(flight: Flight) -> None:
+def test_the_data_of_the_page_equal_the_lines(flight: Flight) -> None:
     found = data_of(render(flight, source="y"))
     assert found["times"] == [round((t - flight.origin_ns) / S, 6) for t in flight.points.times]
     written = [
@@ -101,13 +101,13 @@ def test_the_data_in_the_page_are_those_of_the_lines(flight: Flight) -> None:
     assert ("Speed", "Output", flight.lines[0, "output_speed"]) in written
 
 
-def test_lines_of_different_sizes_have_a_plot_each() -> None:
+def test_lines_of_different_magnitudes_have_separate_plots() -> None:
     speeds = {"output_speed": 850.0, "motor_speed": 8327.0, "electrical_speed": 58344.0}
     assert of_like_size(speeds) == [[source] for source in speeds]
     assert of_like_size({"a": 96.0, "b": 101.0, "c": 0.0, "d": 30.0}) == [["a", "b", "c", "d"]]
 
 
-def test_speeds_share_a_plot_behind_the_battery_of_which_one_line_is_drawn(flight: Flight) -> None:
+def test_speeds_share_a_plot_after_the_battery_and_one_line_is_drawn(flight: Flight) -> None:
     plots = data_of(render(flight, source="y"))["plots"]
     keys = [plot["key"] for plot in plots]
     assert keys[:5] == ["battery_voltage", "cell_voltage", "current", "power", "speed"]
@@ -148,7 +148,7 @@ def test_a_gap_of_years_is_cut_out_and_noted() -> None:
     assert cut == [9.9, flight.cuts[0].length_ns / S]
 
 
-def test_a_part_behind_a_gap_of_years_begins_at_its_own_time_of_day() -> None:
+def test_a_part_after_a_gap_of_years_starts_at_its_own_time_of_day() -> None:
     bus = layout_of(["esc1"])
     times = [at * S // 10 + (400 * 86_400 * S if at >= 100 else 0) for at in range(200)]
     made = Flight(bus.escs, fields_of_log(SignalReader(bus.layout), bus.escs), window=(15.0, None))
@@ -158,7 +158,7 @@ def test_a_part_behind_a_gap_of_years_begins_at_its_own_time_of_day() -> None:
     assert "<dd>1971-02-05 00:00:12 UTC</dd>" in html
 
 
-def test_what_the_dbc_does_not_have_is_left_out(tmp_path: Path) -> None:
+def test_values_missing_in_the_dbc_are_left_out(tmp_path: Path) -> None:
     """Without errors in the DBC no number of them is claimed."""
     file = tmp_path / "lean.dbc"
     signal = ' SG_ BatteryVoltage : 0|16@1+ (0.01,0) [0|655.33] "V" Gw\n'
@@ -170,7 +170,7 @@ def test_what_the_dbc_does_not_have_is_left_out(tmp_path: Path) -> None:
     assert "<span>Errors" not in html
 
 
-def test_times_and_numbers_in_words() -> None:
+def test_times_and_numbers_are_written_for_readers() -> None:
     assert [clock(ns) for ns in (0, 62_540_000_000, 3_661 * S, -1_250 * 10**6)] == [
         *("0:00.0", "1:02.5", "1:01:01.0", "−0:01.2"),
     ]
