@@ -1,4 +1,4 @@
-"""A command within this process: its exit code and what it writes. For whatever a process of its own is not needed."""
+"""Run a command line in this process, if the test does not need a separate process."""
 
 import io
 import sys
@@ -10,10 +10,13 @@ from kontronik_can_gw.cli import main
 
 
 class Done(NamedTuple):
+    """The exit code and the output of a command."""
+
     code: object
     data: bytes
-    """What went to standard output."""
+    """Standard output."""
     err: str
+    """Standard error."""
 
     @property
     def out(self) -> str:
@@ -21,19 +24,20 @@ class Done(NamedTuple):
 
 
 def output() -> io.TextIOWrapper:
-    """A stream as standard output is."""
+    """Return a stream that is like standard output."""
     return io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)
 
 
 def written_to(stream: io.TextIOWrapper) -> bytes:
-    """What an ``output`` holds."""
+    """Return the bytes written to an ``output``."""
     assert isinstance(stream.buffer, io.BytesIO)
     return stream.buffer.getvalue()
 
 
 def run(*words: object, given: bytes | None = None, out: io.TextIOWrapper | None = None) -> Done:
-    """An exception fails the test. ``given``: standard input."""
-    out, err = out or output(), output()
+    """Run a command line. ``given`` is its standard input. An exception fails the test."""
+    out = out or output()
+    err = output()
     stdin = sys.stdin if given is None else io.TextIOWrapper(io.BytesIO(given))
     code: object
     with patch.multiple(sys, stdin=stdin, stdout=out, stderr=err):
@@ -45,16 +49,21 @@ def run(*words: object, given: bytes | None = None, out: io.TextIOWrapper | None
 
 
 def refused(code: int, *words: object, given: bytes | None = None) -> str:
-    """The one line, without the program's name, of a command that fails with this exit code and writes nothing else."""
+    """Run a command that must fail with this exit code and a single line of error.
+
+    Returns the line without the name of the program.
+    """
     done = run(*words, given=given)
     lines = done.err.splitlines()
-    assert (done.code, done.out, "Traceback" in done.err) == (code, "", False), done
+    assert done.code == code, done
+    assert done.out == "", done
+    assert "Traceback" not in done.err, done
     usage = [line for line in lines if line.startswith(("usage:", " "))]
     assert len(lines) - len(usage) == 1, done.err
     return lines[-1].partition(": ")[2]
 
 
 def written(path: Path, text: str | bytes) -> Path:
-    """A file with this content."""
+    """Write a file with this content and return its path."""
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path

@@ -1,4 +1,4 @@
-"""What a bus sees of simulated ESCs: the frames of a real gateway core, with their times; and a clock that tests move."""
+"""The frames that a real gateway core sends for simulated ESCs, and a clock set by tests."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,10 +28,10 @@ Timed = list[tuple[int, CanFrame]]
 
 
 def layout_of(names: Sequence[str]) -> BusLayout:
-    """The shipped DBC for these ESCs."""
-    escs = [
-        {"port": f"/dev/tty{name}", "name": name, "pole_pairs": 7, "gear": 9.8} for name in names
-    ]
+    """Return the layout of the shipped DBC for ESCs of these names."""
+    escs = []
+    for name in names:
+        escs.append({"port": f"/dev/tty{name}", "name": name, "pole_pairs": 7, "gear": 9.8})
     loaded = assemble(parse({"can": {"bitrate": 1_000_000}, "esc": escs}, "test.toml"))
     assert loaded.database is not None
     return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
@@ -45,8 +45,12 @@ def flight(
     replay: bool = False,
     until: float = 1e9,
 ) -> Timed:
-    """What the gateway sends while ESCs fly. ``until``: from then on (s) all lines are silent."""
-    given = [*options, *[EscOptions(profile=FLYING)] * (len(bus.escs) - len(options))]
+    """Return the frames of a gateway with ESCs in flight. All lines are silent after ``until`` (s).
+
+    ESCs without options fly without faults.
+    """
+    others = len(bus.escs) - len(options)
+    given = [*options, *[EscOptions(profile=FLYING)] * others]
     simulated = [SimulatedEsc(each, seed=index) for index, each in enumerate(given)]
     gateway = Gateway(bus.escs, bus.layout, 0)
     for index in range(len(simulated)):
@@ -66,24 +70,25 @@ def flight(
 
 
 def with_errors(*bits: OperatingError | SelfTestError) -> EscOptions:
-    """An ESC that has these bits set all the time."""
-    return EscOptions(
-        profile=FLYING, faults=Faults(errors=tuple(ErrorWindow(bit, 0) for bit in bits))
-    )
+    """Return the options of an ESC that always has these bits set."""
+    errors = tuple(ErrorWindow(bit, 0) for bit in bits)
+    return EscOptions(profile=FLYING, faults=Faults(errors=errors))
 
 
 def write_log(path: Path, frames: Timed, channel: str = "can0", start_s: float = START_S) -> Path:
-    """A candump log."""
+    """Write a candump log."""
     lines = []
     for now, frame in frames:
-        can_id = f"{frame.can_id:08X}" if frame.extended else f"{frame.can_id:03X}"
-        lines.append(f"({start_s + now / 1e9:.6f}) {channel} {can_id}#{frame.data.hex().upper()}\n")
+        time_s = start_s + now / 1e9
+        digits = 8 if frame.extended else 3
+        text = f"{frame.can_id:0{digits}X}#{frame.data.hex().upper()}"
+        lines.append(f"({time_s:.6f}) {channel} {text}\n")
     path.write_text("".join(lines))
     return path
 
 
 class Clock:
-    """Time that passes only by being slept; for what takes the module ``time``."""
+    """A clock that replaces the module ``time`` and advances only in ``sleep``."""
 
     def __init__(self, now: float = 100.0) -> None:
         self.now = now

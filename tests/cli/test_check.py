@@ -1,4 +1,4 @@
-"""What ``check`` says in short and as JSON, and where commands find a configuration that is not named."""
+"""The output of ``check`` as text and as JSON, and the places of an unnamed configuration."""
 
 import json
 import os
@@ -14,7 +14,10 @@ LEAST = '[[esc]]\nport = "/dev/ttyUSB0"\n'
 
 @pytest.fixture
 def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
-    """The files that are taken where none is named: of this folder, then of the machine. Neither exists."""
+    """Return the files that are used if no file is named: the folder's, and the machine's.
+
+    Neither exists.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(arguments, "CONFIG_PLACES", (Path("gateway.toml"), tmp_path / "etc.toml"))
     return tmp_path / "gateway.toml", tmp_path / "etc.toml"
@@ -36,7 +39,8 @@ def test_json_contains_keys_and_warnings_or_the_mistakes(tmp_path: Path) -> None
 def test_the_details_are_the_keys_in_effect_and_the_tables(tmp_path: Path) -> None:
     file = written(tmp_path / "g.toml", f"{LEAST}[dronecan]\nenabled = true\n")
     found = run("check", "-v", file).out.splitlines()
-    assert found[: len(short := run("check", file).out.splitlines())] == short
+    short = run("check", file).out.splitlines()
+    assert found[: len(short)] == short
     assert "telemetry_timeout_ms = 250" in found
     assert any(line.startswith("node asks an allocator") for line in found), found
     rows = [line for line in run("describe", "-c", file).out.splitlines() if "Battery" in line]
@@ -99,11 +103,11 @@ def test_the_fingerprint_identifies_the_layout_in_file_and_frames(
 def test_an_unreadable_file_is_reported_in_one_line(
     places: tuple[Path, Path], code: int, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Within this process, so that root can lay its rights down for the moment: root may read everything."""
+    """Root may read every file, so the test gives up its rights while the command runs."""
     own, _ = places
     monkeypatch.setattr(arguments, "CONFIG_PLACES", (own,))
     written(own, LEAST)
-    run(*words.split())  # imports what it needs, while that can be read
+    run(*words.split())  # imports modules while they can be read
     own.parent.chmod(0)
     user = os.geteuid()
     if user == 0:
@@ -125,10 +129,10 @@ def test_the_usual_and_the_worst_bus_load_are_shown(tmp_path: Path) -> None:
     assert found["worst_bus_load"] - found["bus_load"] == pytest.approx(more * 135 / 500_000)
     lines = run("check", file).out.splitlines()
     usual, worst = lines[-2:]
-    assert (
-        usual.startswith("  bus load  ") and f"{found['frames_per_second']:.0f} frames/s" in usual
-    )
-    assert worst.startswith("  at worst  ") and f"{found['worst_bus_load']:.1%}" in worst
+    assert usual.startswith("  bus load  ")
+    assert f"{found['frames_per_second']:.0f} frames/s" in usual
+    assert worst.startswith("  at worst  ")
+    assert f"{found['worst_bus_load']:.1%}" in worst
     assert len(worst) <= 80
 
 
@@ -166,7 +170,5 @@ def test_a_bad_certificate_is_explained_to_users(
         written(tmp_path / "ca.pem", content)
     table = '[mqtt]\nbroker = "localhost"\ntls = true\nca_file = "ca.pem"\n'
     file = written(tmp_path / "g.toml", f'[can]\ninterface = "virtual"\n{table}{LEAST}')
-    expected = (
-        f"{tmp_path}/ca.pem: {said}. Certificates must be in PEM form, keys without passphrase."
-    )
-    assert refused(2, "mqtt", "-c", file) == expected
+    advice = "Certificates must be in PEM form, keys without passphrase."
+    assert refused(2, "mqtt", "-c", file) == f"{tmp_path}/ca.pem: {said}. {advice}"

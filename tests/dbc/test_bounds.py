@@ -1,4 +1,4 @@
-"""A DBC that asks for too much: one line, before cantools sees it."""
+"""A DBC that needs too much memory or time is refused in one line, before cantools reads it."""
 
 from pathlib import Path
 
@@ -19,10 +19,17 @@ ATTRIBUTE = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\n'
 
 
 def nested(depth: int, width: int) -> str:
-    """Multiplexers in a chain, each page of each with all pages of the next: ``width`` to the power of ``depth`` pages."""
-    signals = [f' SG_ s{n} m0M : {n}|1@1+ (1,0) [0|0] "" A\n' for n in range(1, depth)]
-    ranges = [f"SG_MUL_VAL_ 1 s{n} s{n - 1} 0-{width - 1};\n" for n in range(1, depth)]
-    return "".join(['BO_ 1 Msg: 8 A\n SG_ s0 M : 0|1@1+ (1,0) [0|0] "" A\n', *signals, *ranges])
+    """Return a message with a chain of multiplexers.
+
+    Each page of a multiplexer has all pages of the next one, so that there are ``width`` to the
+    power of ``depth`` pages.
+    """
+    lines = ["BO_ 1 Msg: 8 A", ' SG_ s0 M : 0|1@1+ (1,0) [0|0] "" A']
+    for n in range(1, depth):
+        lines.append(f' SG_ s{n} m0M : {n}|1@1+ (1,0) [0|0] "" A')
+    for n in range(1, depth):
+        lines.append(f"SG_MUL_VAL_ 1 s{n} s{n - 1} 0-{width - 1};")
+    return "\n".join([*lines, ""])
 
 
 @pytest.mark.parametrize(
@@ -55,9 +62,10 @@ def nested(depth: int, width: int) -> str:
 def test_a_file_out_of_bounds_is_refused_in_one_line_without_cantools(
     text: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        cantools.database, "load_string", lambda *_, **__: pytest.fail("cantools was called")
-    )
+    def must_not_be_called(*_: object, **__: object) -> None:
+        pytest.fail("cantools was called")
+
+    monkeypatch.setattr(cantools.database, "load_string", must_not_be_called)
     with pytest.raises(UserError) as caught:
         parse_database((HEAD + text).encode(), "my.dbc")
     (line,) = caught.value.problems

@@ -1,4 +1,8 @@
-"""A user's DBC as other tools write it: entries for nothing, units, send types, counters, checksums, flags, unbound signals."""
+"""A user's DBC as other tools write it.
+
+It has entries for missing objects, other units and send types, counters, checksums, flags and
+signals that are bound to no value.
+"""
 
 import itertools
 import json
@@ -30,7 +34,19 @@ def signal(
     return f' SG_ {name} : {place} ({scale}) [{ends}] "{unit}" Other\n'
 
 
-HEAD = 'VERSION ""\nNS_ :\n\tNS_DESC_\n\tVAL_\n\tVAL_TABLE_\n\tBA_DEF_\n\tSIG_VALTYPE_\n\nBS_:\n\nBU_: Gateway Other\n\n'
+HEAD = """VERSION ""
+NS_ :
+\tNS_DESC_
+\tVAL_
+\tVAL_TABLE_
+\tBA_DEF_
+\tSIG_VALTYPE_
+
+BS_:
+
+BU_: Gateway Other
+
+"""
 MESSAGE = f"{HEAD}BO_ 256 Power: 8 Gateway\n"
 STATE = MESSAGE + signal("OperatingState")
 START = 'BA_DEF_ SG_ "GenSigStartValue" FLOAT 0 0;\n'
@@ -40,7 +56,7 @@ def start_of(name: str, value: object, number: int = 256) -> str:
     return f'BA_ "GenSigStartValue" SG_ {number} {name} {value};\n'
 
 
-# --- entries ------------------------------------------------------------------------------------------------------------
+# --- entries
 
 
 def test_comments_and_value_texts_are_not_touched() -> None:
@@ -81,7 +97,7 @@ def test_an_entry_for_a_missing_object_is_ignored_with_a_warning(entry: str, wor
     assert message.signals[0].choices is None and message.signals[0].comment == comment
 
 
-# --- units --------------------------------------------------------------------------------------------------------------
+# --- units
 
 IRRATIONAL = ("1/min", "rad/s|radians/sec|Rad/Sec|Unit_RadPerSecon", str(math.pi / 30), "0")
 SPELLED = [IRRATIONAL, *((unit, *row) for unit, rows in UNITS.items() for row in rows)]
@@ -97,10 +113,18 @@ def test_a_unit_is_recognised_in_each_of_its_spellings(
 
 
 def test_a_unit_of_another_quantity_or_of_two_meanings_is_refused() -> None:
-    """What is possible instead is listed: tests/golden/commands/refused_dbc.txt."""
-    others = {"V": "MV A 1 x Unit_ deg m/s ° Nm", "%": "V", "degC": "deg", "1/min": "Hz m/s", "": "V %", "W": "MW"}  # fmt: skip
+    """The lines of refusal, with the units that are possible, are in the golden set."""
+    others = {
+        "V": "MV A 1 x Unit_ deg m/s ° Nm",
+        "%": "V",
+        "degC": "deg",
+        "1/min": "Hz m/s",
+        "": "V %",
+        "W": "MW",
+    }
     for unit, texts in others.items():
-        assert [conversion(unit, text) for text in texts.split()] == [None] * len(texts.split())
+        for text in texts.split():
+            assert conversion(unit, text) is None, text
 
 
 def test_dbc_units_overrides_the_usual_meaning_of_a_text() -> None:
@@ -109,12 +133,14 @@ def test_dbc_units_overrides_the_usual_meaning_of_a_text() -> None:
     units = {"Zaehler": "mV", "A": "mV"}
     (plan,) = compiled(text, units=units).messages
     assert [(s.unit, float(s.slope)) for s in plan.signals] == [("mV", 1000), ("mV", 1)]
-    assert refused(text, units=units | {"Zahler": "V"}) == [
-        "dbc.units.Zahler: no signal of Gateway has this unit in my_car.dbc. Did you mean 'Zaehler'?"
-    ]
+    (line,) = refused(text, units=units | {"Zahler": "V"})
+    assert line == (
+        "dbc.units.Zahler: no signal of Gateway has this unit in my_car.dbc. "
+        "Did you mean 'Zaehler'?"
+    )
 
 
-# --- which messages, and signals bound to nothing ----------------------------------------------------------------------
+# --- the selection of messages, and unbound signals
 
 OURS = ("Motor_11", "Motor_12", "Brake_1")
 ECU = (
@@ -187,25 +213,26 @@ def test_a_start_value_may_be_any_number_that_fits_into_the_signal() -> None:
         assert "Power.Foo" in line and f"GenSigStartValue {number}" in line
 
 
-# --- send types ---------------------------------------------------------------------------------------------------------
+# --- send types
 
 SPELLINGS = {
-    "Cyclic": "Cyclic cyclic cyclicX fixedCyclic FixedPeriodic Periodic cyclicIfActive IfActive EnabledPeriodic cyclicIfActiveX "
-    "CyclicIfActiveFast",
-    "Event": "Event spontaneous spontan spontanX spontaneousWithDelay spontanWithDelay spontaneousWithRepetition OnWrite "
-    "OnWriteWithRepetition",
+    "Cyclic": "Cyclic cyclic cyclicX fixedCyclic FixedPeriodic Periodic cyclicIfActive IfActive "
+    "EnabledPeriodic cyclicIfActiveX CyclicIfActiveFast",
+    "Event": "Event spontaneous spontan spontanX spontaneousWithDelay spontanWithDelay "
+    "spontaneousWithRepetition OnWrite OnWriteWithRepetition",
     "OnChange": "OnChange OnChangeWithRepetition",
-    "CyclicAndEvent": "cyclicAndSpontaneous cyclicAndSpontanX cyclicAndSpontanWithDelay CyclicAndSpontaneousWithDelay EventPeriodic "
-    "cyclicIfActiveAndSpontanWD PeriodicAndEvent",
+    "CyclicAndEvent": "cyclicAndSpontaneous cyclicAndSpontanX cyclicAndSpontanWithDelay "
+    "CyclicAndSpontaneousWithDelay EventPeriodic cyclicIfActiveAndSpontanWD PeriodicAndEvent",
     "CyclicAndOnChange": "CyclicAndOnChange OnChangeAndIfActive OnChangeAndIfActiveWithRepetition",
     "": "vector_leerstring NoMsgSendType None NotUsed NoSigSendType nomsgsendtype",
 }
 
 
 def all_sent(text: str, cycle: int = 20) -> str:
-    """A DBC whose messages have this send type."""
+    """Return a DBC whose messages have this send type."""
     return (
-        f'{STATE}BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","{text}";\nBA_DEF_DEF_ "GenMsgSendType" "{text}";\n'
+        f'{STATE}BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","{text}";\n'
+        f'BA_DEF_DEF_ "GenMsgSendType" "{text}";\n'
         'BA_DEF_ BO_ "GenMsgCycleTimeFast" INT 0 0;\nBA_DEF_DEF_ "GenMsgCycleTimeFast" 0;\n'
         f'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 0;\nBA_DEF_DEF_ "GenMsgCycleTime" {cycle};\n'
     )
@@ -227,16 +254,19 @@ def test_an_unknown_send_type_is_refused_unless_dbc_send_type_defines_it(text: s
     for name, meaning in ((text, "CyclicAndEvent"), ("OnChange", "Event")):
         (plan,) = compiled(all_sent(name), send_type={name: meaning}).messages
         assert plan.send_type == SEND_TYPES[meaning]
-    assert refused(all_sent("Event"), send_type={"Evnt": "Cyclic"}) == [
-        "dbc.send_type.Evnt: no message of Gateway has this GenMsgSendType in my_car.dbc. Did you mean 'Event'?"
-    ]
+    (line,) = refused(all_sent("Event"), send_type={"Evnt": "Cyclic"})
+    assert line == (
+        "dbc.send_type.Evnt: no message of Gateway has this GenMsgSendType in my_car.dbc. "
+        "Did you mean 'Event'?"
+    )
 
 
-# --- counters and checksums ---------------------------------------------------------------------------------------------
+# --- counters and checksums
 
 
 NAMES = {
-    Role.ALIVE: "MsgCntr AliveCnt COUNTER Counter CTR Motor_11_BZ SQC Gear_SQC XMsgCnt LWI_Botschaftszaehler AliveCtr",
+    Role.ALIVE: "MsgCntr AliveCnt COUNTER Counter CTR Motor_11_BZ SQC Gear_SQC XMsgCnt "
+    "LWI_Botschaftszaehler AliveCtr",
     Role.CRC: "CHKSM CRC8 Checksum Motor_11_CRC Chksum EPS_CKS Mdps_CS",
     None: "ErrorCounter AliveCnt2 COUNTER_PEDAL Alive_1 ABZ Brebz Gas_CSX",
 }
@@ -284,12 +314,12 @@ def test_names_that_0_5_0_took_for_e2e_profile_1_cause_a_warning() -> None:
     warned = "".join(compiled(text).warnings)
     assert "AUTOSAR E2E profile 1" in warned and "= 0x100" in warned
     assert "E2E" not in "".join(compiled(text, e2e_data_ids={"Power": 0x100}).warnings)
-    # a counter by its binding is one by its name
+    # a counter that is bound counts in the same way as one found by its name
     other = compiled(text.replace("Alive", "MsgNo"), bind={"MsgNo": "alive"})
     assert [signal.role for signal in other.messages[0].signals] == [Role.CRC, Role.ALIVE]
 
 
-# --- flags without telemetry --------------------------------------------------------------------------------------------
+# --- flags without telemetry
 
 FLAG = MESSAGE + signal("Undervoltage", "0|1@1+", ends="0|1")
 INVERTED = FLAG.replace("(1,0)", "(-1,1)")
@@ -302,7 +332,8 @@ SNA = 'VAL_ 256 Undervoltage 1 "NotAvailable" ;\n'
         (FLAG, None, 0),
         (FLAG, 0, 0),
         (FLAG, 1, 1),
-        (f'{FLAG}{START}BA_DEF_DEF_ "GenSigStartValue" 1;', None, 0),  # says nothing of this flag
+        # a default of the attribute does not apply to the flag
+        (f'{FLAG}{START}BA_DEF_DEF_ "GenSigStartValue" 1;', None, 0),
         (FLAG + START + start_of("Undervoltage", 1), None, 1),
         (FLAG + START + start_of("Undervoltage", 2), None, 0),
         (FLAG + START + start_of("Undervoltage", 1), 0, 0),
@@ -349,14 +380,14 @@ STATES = signal("OperatingState", "8|8@1+") + 'VAL_ 256 OperatingState 7 "MotorO
         (signal("BatteryVoltage", "8|16@1+", "V", "0.01,0"), None),
         (signal("BatteryVoltage", "8|16@1+", "V", "0.01,0", "0|100"), "BatteryVoltage"),
         (signal("LinkState", "8|8@1+"), "LinkState"),
-        # of the information, which outlives the link
+        # the device is an info value, which stays available for longer than the link
         (signal("Device", "8|8@1+", ends="0|5"), None),
         (signal("BecCurrent", "8|16@1+", "A", "0.01,0", "0|100"), None),  # never on a JIVEPro
         (percent("0|0"), "Throttle"),
         (signal("MessageAlive", "8|8@1+"), None),
         (percent("0|100", 101), "Throttle"),
         (percent("0|100", -1), "Throttle"),
-        (percent("0|100", 100), None),  # a code amid the values
+        (percent("0|100", 100), None),  # the code is one of the values
         (percent("0|100", 0), None),
         (STATES, "OperatingState"),
         (STATES + START + start_of("OperatingState", 7), None),
@@ -401,7 +432,7 @@ def test_a_capture_stores_the_dbc_settings_and_0_5_0_stored_fewer() -> None:
     assert CaptureSetup.of(header).dbc_settings == old
 
 
-# --- what the grammar allows and cantools refuses, or takes for something else -------------------------------------------
+# --- entries that the grammar allows, and that cantools refuses or misreads
 
 
 @pytest.mark.parametrize(
@@ -492,7 +523,9 @@ def test_frames_with_a_cycle_of_a_fraction_keep_it_on_average() -> None:
     gateway = gateway_with(compiled(STATE + text))
     times = []
     now = 0
-    while (now := max(now, gateway.next_deadline())) < 2000 * MS:
+    while now < 2000 * MS:
         gateway.advance(now)
         times += [now] * len(gateway.take_frames(now))
-    assert {b - a for a, b in itertools.pairwise(times)} == {12_500_000}
+        now = max(now, gateway.next_deadline())
+    distances = {after - before for before, after in itertools.pairwise(times)}
+    assert distances == {12_500_000}

@@ -1,4 +1,7 @@
-"""The shipped DBCs: rules that make every tool read them alike, and cantools, canmatrix, opendbc and asammdf, which do."""
+"""The shipped DBCs follow rules so that every tool reads them in the same way.
+
+They are read by cantools, canmatrix, opendbc and asammdf.
+"""
 
 import logging
 import math
@@ -50,7 +53,7 @@ def table_of(signal: Signal) -> dict[int, str]:
 
 
 def names_of(signal: Signal) -> dict[int, str]:
-    """Texts of a signal's values, without the codes."""
+    """Return the texts of a signal's values, without the codes."""
     return {number: text for number, text in table_of(signal).items() if text not in CODES}
 
 
@@ -58,28 +61,34 @@ def exact(*numbers: Any) -> list[Decimal]:
     return [Decimal(str(number)) for number in numbers]
 
 
-# --- the rules, and the sheet -------------------------------------------------------------------------------------------
+# --- the rules, and the sheet
 
 
 def test_limits_leave_out_the_codes_and_contain_0() -> None:
-    """[min|max] is the whole type less the two codes, of an enum 0 to its greatest name. canmatrix checks the default start
-    value, 0, against it."""
+    """Test [min|max] of all signals.
+
+    It is the range of the type without the two codes. For an enumeration it is 0 to the greatest
+    value that has a name. canmatrix checks the default start value, which is 0, against it.
+    """
     for signal in signals_of(SHIPPED):
         if signal.length == 1 or signal.name.endswith("Alive"):  # flags and counters have no codes
             continue
         most = (1 << signal.length - signal.is_signed) - 1
-        raw = (2 - most - 1, most) if signal.is_signed else (0, most - 2)
-        if named := names_of(signal):
+        named = names_of(signal)
+        if named:
             raw = (0, max(named))
-        low, high, factor, offset = exact(
-            signal.minimum, signal.maximum, signal.scale, signal.offset
-        )
+        elif signal.is_signed:
+            raw = (1 - most, most)
+        else:
+            raw = (0, most - 2)
+        low, high = exact(signal.minimum, signal.maximum)
+        factor, offset = exact(signal.scale, signal.offset)
         assert [low, high] == [number * factor + offset for number in raw], signal.name
         assert low <= 0 <= high, signal.name
 
 
 def test_exactly_the_values_of_enumerations_have_names() -> None:
-    """One unknown sample costs asammdf all names."""
+    """If a single sample has no name, asammdf shows the names of no sample."""
     named = [signal for signal in signals_of(SHIPPED) if names_of(signal)]
     assert {signal.name: names_of(signal) for signal in named} == ENUMS
     assert not any(s.is_signed or s.unit or s.scale != 1 for s in named)
@@ -113,7 +122,7 @@ def test_a_signal_holds_every_step_of_its_field_in_the_sheet(field: sheet.Field)
     assert least <= low * step and high * step <= most
 
 
-# --- other tools --------------------------------------------------------------------------------------------------------
+# --- other tools
 
 
 @BOTH
@@ -140,15 +149,16 @@ def matrix_of(file: Path, caplog: pytest.LogCaptureFixture) -> Any:
 def test_canmatrix_and_cantools_read_the_same_content(
     file: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    matrix, database = matrix_of(file, caplog), database_of(file)
+    matrix = matrix_of(file, caplog)
+    database = database_of(file)
     assert [ecu.name for ecu in matrix.ecus] == [node.name for node in database.nodes]
     attributes: Any = database.dbc
     version = attributes.attributes["LayoutVersion"].value
     assert matrix.attributes == {"LayoutVersion": version, "BusType": "CAN"}
     for message, seen in zip(database.messages, matrix.frames, strict=True):
-        place = (seen.name, seen.arbitration_id.id, seen.size, seen.transmitters, seen.comment)
-        own = (message.name, message.frame_id, message.length, message.senders, message.comment)
-        assert place == own
+        assert (seen.name, seen.arbitration_id.id) == (message.name, message.frame_id)
+        assert (seen.size, seen.transmitters) == (message.length, message.senders)
+        assert seen.comment == message.comment
         kinds = (seen.arbitration_id.extended, seen.is_fd, seen.is_j1939, seen.is_multiplexed)
         assert not any(kinds)
         assert seen.attributes["GenMsgSendType"] == message.send_type
@@ -169,11 +179,17 @@ def test_canmatrix_and_cantools_read_the_same_content(
 def test_all_readers_decode_the_same_raw_values_from_any_bytes(
     file: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """opendbc takes a path where one exists, else the name of a packaged file, and skips what it does not understand."""
+    """Compare opendbc, canmatrix, cantools and our own code.
+
+    opendbc skips all lines that it does not understand. If the path does not exist, it reads a
+    packaged file of that name.
+    """
     from opendbc.can.dbc import DBC
     from opendbc.can.parser import get_raw_value
 
-    opendbc, matrix, database = DBC(str(file)).msgs, matrix_of(file, caplog), database_of(file)
+    opendbc = DBC(str(file)).msgs
+    matrix = matrix_of(file, caplog)
+    database = database_of(file)
     choice = random.Random(1)
     names = {message.frame_id: message.name for message in database.messages}
     assert {number: found.name for number, found in opendbc.items()} == names
@@ -184,51 +200,61 @@ def test_all_readers_decode_the_same_raw_values_from_any_bytes(
         size = message.length
         fills = [choice.randbytes(size) for _ in range(FRAMES_PER_MESSAGE)]
         for data in (bytes(size), b"\xff" * size, *fills):
-            expected = {
-                s.name: get(data, s.start, s.length, True, s.is_signed) for s in message.signals
-            }
+            expected = {}
+            for signal in message.signals:
+                raw = get(data, signal.start, signal.length, True, signal.is_signed)
+                expected[signal.name] = raw
             assert expected == message.decode(data, decode_choices=False, scaling=False)
             decoded = matrix.frame_by_name(message.name).decode(data)
             assert {name: seen.raw_value for name, seen in decoded.items()} == expected
             for name, its in theirs.items():
                 raw = get_raw_value(data, its)
-                raw -= (raw >> (its.size - 1) << its.size) if its.is_signed else 0
+                if its.is_signed:
+                    sign = raw >> (its.size - 1)
+                    raw -= sign << its.size
                 assert raw == expected[name], name
 
 
 def recorded(path: Path, file: Path, moments: list[dict[str, int]]) -> Any:
-    """An MF4 of raw CAN frames, one of each message per moment and 0.1 s, decoded by asammdf with the DBC."""
+    """Write raw CAN frames into an MF4 file and return it decoded by asammdf with the DBC.
+
+    The file has a frame of each message for each moment. A moment lasts 0.1 s.
+    """
     import can
     from asammdf import MDF
 
     with can.MF4Writer(path) as writer:
         for number, moment in enumerate(moments):
             for message in database_of(file).messages:
-                at, data = 1_700_000_000 + number / 10, bytearray(message.length)
+                data = bytearray(message.length)
                 for signal in message.signals:
                     put(data, moment[signal.name], signal.start, signal.length, True)
-                writer.on_message_received(
-                    can.Message(
-                        at, arbitration_id=message.frame_id, is_extended_id=False, data=data
-                    )
+                frame = can.Message(
+                    1_700_000_000 + number / 10,
+                    arbitration_id=message.frame_id,
+                    is_extended_id=False,
+                    data=data,
                 )
+                writer.on_message_received(frame)
     with MDF(path) as measurement:
         return measurement.extract_bus_logging({"CAN": [(str(file), 0)]})
 
 
 @BOTH
 def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path, file: Path) -> None:
-    """Of values that the gateway may send: within the limits, of an enum one with a name, and the two codes."""
+    """Decode values that the gateway may send.
+
+    These are values within the limits, values of enumerations that have a name, and the two codes.
+    """
     import numpy as np
 
     choice = random.Random(2)
     raw: list[dict[str, int]] = [{} for _ in range(30)]
     for signal in signals_of(file):
-        table, (low, high, factor) = (
-            table_of(signal),
-            exact(signal.minimum, signal.maximum, signal.scale),
-        )
-        least, most = int(low / factor), int(high / factor)
+        table = table_of(signal)
+        low, high, factor = exact(signal.minimum, signal.maximum, signal.scale)
+        least = int(low / factor)
+        most = int(high / factor)
         named = [number for number in table if least <= number <= most]
         codes = {text: number for number, text in table.items()}
         for moment, values in enumerate(raw):
@@ -237,7 +263,8 @@ def test_asammdf_gives_numbers_nan_and_names(tmp_path: Path, file: Path) -> None
             values[signal.name] = codes.get(code, choice.choice(ends))
     decoded = recorded(tmp_path / "raw.mf4", file, raw)
     for signal in signals_of(file):
-        seen, table = decoded.get(signal.name), table_of(signal)
+        seen = decoded.get(signal.name)
+        table = table_of(signal)
         sent = [moment[signal.name] for moment in raw]
         assert list(decoded.get(signal.name, raw=True).samples) == sent, signal.name
         assert seen.unit == (signal.unit or "")

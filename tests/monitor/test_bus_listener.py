@@ -1,4 +1,4 @@
-"""The listener on a fake port whose interface disappears; on a real one: tests/vcan."""
+"""The listener on a fake port whose interface disappears. A real port is used in tests/vcan."""
 
 import itertools
 
@@ -16,10 +16,12 @@ FRAME = CanFrame(0x123, b"\x01\x02")
 
 
 class FakePort:
-    """A port whose interface can be taken away; nothing may be sent with it: it has no way to."""
+    """A port whose interface can be removed. It has no method for sending."""
 
     opened: list["FakePort"]
-    gone, state, overruns = False, CanState.UNKNOWN, 0
+    gone = False
+    state = CanState.UNKNOWN
+    overruns = 0
 
     def __init__(self, _config: CanConfig) -> None:
         self.inbox: list[CanFrame] = []

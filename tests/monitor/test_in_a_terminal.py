@@ -1,4 +1,4 @@
-"""The screen in a real terminal (tmux): drawn, obeying keys, and leaving the terminal as it was."""
+"""The screen in a real terminal (tmux): it is drawn, reacts to keys, and restores the terminal."""
 
 import os
 import shlex
@@ -20,27 +20,34 @@ pytestmark = [
     pytest.mark.skipif(shutil.which("tmux") is None, reason="apt-get install tmux"),
 ]
 SLOWLY = ("--speed", "0.25")
-"""The recording must not be over before the last key."""
+"""Plays so slowly that the recording does not end before the last key."""
 
 
 class Terminal:
-    """A shell of 80 x 24 characters in a tmux server of its own."""
+    """A shell of 80 x 24 characters in a separate tmux server."""
 
     def __init__(self, folder: Path) -> None:
         self._socket = str(folder / "tmux")
-        paths = {"PATH": os.environ["PATH"], "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        self._environment = paths | {"HOME": str(folder), "LANG": "C.UTF-8", "SHELL": "/bin/sh"}
+        self._environment = {
+            "PATH": os.environ["PATH"],
+            "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+            "HOME": str(folder),
+            "LANG": "C.UTF-8",
+            "SHELL": "/bin/sh",
+        }
         self.tmux("-f", "/dev/null", "new-session", "-d", "-x", "80", "-y", "24", "/bin/sh")
         self.tmux("set", "-g", "status", "off")
 
     def tmux(self, *words: str) -> str:
-        command, env = ["tmux", "-u", "-S", self._socket, *words], self._environment
+        command = ["tmux", "-u", "-S", self._socket, *words]
+        env = self._environment
         return subprocess.check_output(command, text=True, env=env, timeout=60)
 
     def lines(self) -> list[str]:
         return [line.rstrip() for line in self.tmux("capture-pane", "-p").split("\n")[:-1]]
 
     def until(self, wanted: Callable[[list[str]], object], what: str) -> None:
+        """Wait until the lines are as wanted, for at most a minute."""
         end = time.monotonic() + 60
         while not wanted(lines := self.lines()):
             assert time.monotonic() < end, f"{what}: not within a minute:\n" + "\n".join(lines)

@@ -1,4 +1,7 @@
-"""The model: values by the names of sources, extremes, states, errors; what is not available is nothing."""
+"""The model of the monitor: values by the names of sources, extremes, states and errors.
+
+A value that is not available is None.
+"""
 
 import json
 from collections.abc import Sequence
@@ -30,7 +33,7 @@ LINK_ID = next(
 
 
 def watched(bus: BusLayout, frames: Timed, until: float | None = None) -> Monitor:
-    """A monitor that has seen frames, and time up to ``until`` (s)."""
+    """Return a monitor that has received frames, and whose clock is at ``until`` (s)."""
     monitor = Monitor(bus)
     monitor.advance(0)
     for now, frame in frames:
@@ -48,7 +51,7 @@ FRAME = st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.booleans
 @given(st.lists(VALUE, min_size=1, max_size=30))
 @settings(max_examples=50, deadline=None)
 def test_extremes_and_availability_are_right_for_any_values(values: list[int | None]) -> None:
-    """Frames packed by cantools; None is sent as NotAvailable."""
+    """The frames are packed by cantools. None is sent as NotAvailable."""
     message = ONE.database.get_message_by_name("EscCurrent")
     monitor = Monitor(ONE)
     esc = monitor.escs[0]
@@ -62,8 +65,11 @@ def test_extremes_and_availability_are_right_for_any_values(values: list[int | N
             sent.append(current)
         assert esc.number("battery_current") == pytest.approx(current)
         track = esc.tracks["battery_current"]
-        extremes = (pytest.approx(min(sent)), pytest.approx(max(sent))) if sent else (None, None)
-        assert (track.low, track.high) == extremes
+        if sent:
+            assert track.low == pytest.approx(min(sent))
+            assert track.high == pytest.approx(max(sent))
+        else:
+            assert (track.low, track.high) == (None, None)
     monitor.reset()
     track = esc.tracks["battery_current"]
     assert (track.low, track.high, list(track.history)) == (None, None, [])
@@ -74,7 +80,7 @@ def test_extremes_and_availability_are_right_for_any_values(values: list[int | N
 def test_any_frames_are_accepted_without_an_exception(
     frames: Sequence[tuple[int, bytes, bool]], data: st.DataObject
 ) -> None:
-    """Foreign ids, short data, any bits; times that jump."""
+    """The frames have foreign ids, short data and any bits, and their times jump."""
     monitor = Monitor(ONE)
     ids = sorted(key for key in monitor.view.reader.keys)
     for number, content, known in frames:
@@ -106,7 +112,7 @@ def test_old_values_are_not_shown_after_the_last_frame() -> None:
 
 
 def test_the_history_has_a_value_for_each_second_with_data() -> None:
-    """The line is silent from 3.5 s on; the values end with the time-out of telemetry."""
+    """The line is silent after 3.5 s, and the values end with the time-out of telemetry."""
     monitor = watched(ONE, flight(ONE, 6, until=3.5), 7.05)
     history = list(monitor.escs[0].tracks["battery_voltage"].history)
     assert len(history) == 7
@@ -117,7 +123,10 @@ def test_the_history_has_a_value_for_each_second_with_data() -> None:
 
 
 def test_a_link_is_not_lost_because_its_message_is_received_later() -> None:
-    """Of the link's messages one was on its way when the values came, and the next comes a cycle later."""
+    """An older message with the link state may be received after newer values.
+
+    The next message with the link state is received a cycle later.
+    """
     frames = flight(ONE, 3, until=1)
     (esc,) = watched(ONE, frames).escs
     assert (esc.number("battery_voltage"), normalize(esc.link or "")) == (None, "lost")
@@ -167,12 +176,15 @@ BA_DEF_DEF_  "GenMsgCycleTime" 20;
 
 
 def test_a_users_dbc_with_other_names_and_units_shows_the_same(tmp_path: Path) -> None:
-    """And a 29-bit id."""
+    """The DBC also has a 29-bit id."""
     (tmp_path / "car.dbc").write_text(USERS_DBC)
     bind = {
-        "PackVolt": "battery_voltage", "StageTemp": "power_stage_temperature", "ErrorWord": "operating_errors",
-        "Zustand": "operating_state", "Zellen": "cell_count",
-    }  # fmt: skip
+        "PackVolt": "battery_voltage",
+        "StageTemp": "power_stage_temperature",
+        "ErrorWord": "operating_errors",
+        "Zustand": "operating_state",
+        "Zellen": "cell_count",
+    }
     dbc = {"file": str(tmp_path / "car.dbc"), "bind": bind}
     tables = {"dbc": dbc, "esc": [{"port": "/dev/ttyX"}]}
     loaded = assemble(parse(tables, str(tmp_path / "c.toml")))

@@ -1,4 +1,7 @@
-"""The command: --once and lines from a bus and from files; clear lines for mistakes; nothing is ever sent."""
+"""The command ``monitor``: ``--once`` and ``--stream`` from a bus and from files, and mistakes.
+
+The command never sends a frame.
+"""
 
 import ast
 import inspect
@@ -39,7 +42,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
-    """What the command does with signals is undone."""
+    """Assert that the command restores the handlers of signals."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield
     assert {number: signal.getsignal(number) for number in before} == before
@@ -52,7 +55,7 @@ def document(done: Done) -> dict[str, Any]:
 
 
 def test_the_monitor_has_no_code_that_sends() -> None:
-    """The way to the bus has no method to send with, and its sources call none."""
+    """The listener has no method that sends, and the modules call no such method."""
     assert not [name for name in dir(bus_listener.BusListener) if "send" in name]
     for module in (monitor, member, model, screen, sources, watch, bus_listener):
         for node in ast.walk(ast.parse(inspect.getsource(module))):
@@ -64,7 +67,7 @@ def test_the_monitor_has_no_code_that_sends() -> None:
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     tmp_path: Path, command: list[str]
 ) -> None:
-    """Some adapters are written to at opening; to an ESC nothing may be written."""
+    """Opening some adapters writes to them, and nothing may be written to an ESC."""
     port = written(tmp_path / "ttyESC", "")
     toml = written(tmp_path / "g.toml", f'[can]\ninterface = "virtual"\n[[esc]]\nport = "{port}"\n')
     done = run(*command, "-c", toml, "--interface", "slcan", "--channel", f"{port}@115200")
@@ -131,11 +134,11 @@ def test_a_recording_is_played_in_real_time(log: Path, clock: Clock, speed: floa
     assert "END OF FILE" in recording.progress
 
 
-# --- one line of JSON each second
+# --- a line of JSON each second
 
 
 def seconds_of(document: dict[str, Any]) -> float:
-    """Unix time of a line."""
+    """Return the Unix time of a line."""
     return datetime.fromisoformat(document["time"]).timestamp()
 
 
@@ -158,10 +161,8 @@ def test_stream_writes_a_line_each_second_of_a_recording(log: Path, clock: Clock
             monitor.take(frame, now)
         monitor.advance(due)
         assert seconds_of(one) == START_S + number
-        assert (
-            one["escs"][0]["values"]
-            == json.loads(json.dumps(monitor.document()))["escs"][0]["values"]
-        )
+        expected = json.loads(json.dumps(monitor.document()))
+        assert one["escs"][0]["values"] == expected["escs"][0]["values"]
         assert one["frames"] == len(frames) - len(waiting)
     assert len(found) == 12 and found[-1]["frames"] == len(frames)
     assert {one["problem"] for one in found} == {None}
@@ -214,16 +215,17 @@ def test_stream_of_a_bus_without_frames_gives_the_reason() -> None:
     watch.stream(source, model.Monitor(ONE), found.append, lambda: len(found) == 3)
     assert [one["problem"] for one in found] == [None, *["CAN interface can0: is down."] * 2]
     assert [one["interface"] for one in found] == ["can0"] * 3
-    assert {value for one in found for value in one["escs"][0]["values"].values()} == {None}
+    for one in found:
+        assert set(one["escs"][0]["values"].values()) == {None}
 
 
-# --- a name is an interface's or a recording's
+# --- the name of an interface or of a recording
 
 
 @pytest.mark.parametrize(
     ("name", "words", "channel"),
     [
-        ("vcan7", (), "vcan7"),  # no file, no interface: the error is about an interface
+        ("vcan7", (), "vcan7"),  # neither exists: the error is about an interface
         ("lo", (), "lo"),  # an interface, although there is such a file
         ("bus", ("--interface", "virtual"), "bus"),
         ("./lo", (), None),

@@ -1,4 +1,7 @@
-"""The screen: fits any terminal, and shows what matters at 60x20, 80x24 and 120x40 for one to eight ESCs."""
+"""The screen fits into any terminal.
+
+At 60x20, 80x24 and 120x40 it shows the important values of one to eight ESCs.
+"""
 
 import re
 from functools import cache
@@ -22,7 +25,8 @@ from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 
 def source_of(monitor: Monitor, name: str = "can0", problem: str = "") -> Source:
     made = Source(name, bus_of(len(monitor.escs)))
-    made.problem, made.hints = problem, ("Is the gateway running?",)
+    made.problem = problem
+    made.hints = ("Is the gateway running?",)
     return made
 
 
@@ -37,24 +41,30 @@ KINDS = ["good", "errors", "lost", "silent", "replay", "none"]
 
 @cache
 def seen(count: int, kind: str = "good") -> Monitor:
-    """A monitor of ``count`` ESCs in flight; the first with errors, silent, or all without faults."""
+    """Return a monitor of ``count`` ESCs in flight.
+
+    With some kinds the first ESC has errors, or all ESCs or the gateway become silent.
+    """
     bus = bus_of(count)
     errors = with_errors(OperatingError.UNDERVOLTAGE, OperatingError.BEC_OVERCURRENT)
     first = errors if kind == "errors" else EscOptions(device=Device.JIVEPRO)
     monitor = Monitor(bus)
     monitor.advance(0)
-    until, seconds = 1.5 if kind == "lost" else 9, 0 if kind == "none" else 3.2
-    for now, frame in flight(bus, seconds, [first], replay=kind == "replay", until=until):
+    seconds = 0 if kind == "none" else 3.2
+    until = 1.5 if kind == "lost" else 9
+    frames = flight(bus, seconds, [first], replay=kind == "replay", until=until)
+    for now, frame in frames:
         monitor.take(frame, now)
         monitor.advance(now)
-    monitor.advance(round(({"silent": 10.4, "none": 1}.get(kind, 3.2)) * SECOND_NS))
+    end_s = {"silent": 10.4, "none": 1}.get(kind, 3.2)
+    monitor.advance(round(end_s * SECOND_NS))
     return monitor
 
 
 def texts(
     monitor: Monitor, size: tuple[int, int], source: Source | None = None, page: int = 0
 ) -> list[str]:
-    """The words alone."""
+    """Return the lines of the screen without colours."""
     lines = screen(monitor, source or source_of(monitor), size, page)
     return [line.plain.rstrip() for line in lines]
 
@@ -91,7 +101,8 @@ def test_important_lines_are_never_cut_off(size: tuple[int, int], count: int) ->
 
 
 def test_errors_are_shown_with_their_remedies_if_there_is_room() -> None:
-    monitor, first = seen(8, "errors"), "-> Stop soon. Charge or check"
+    monitor = seen(8, "errors")
+    first = "-> Stop soon. Charge or check"
     assert first in "\n".join(texts(monitor, (80, 40)))
     assert first in "\n".join(texts(monitor, (80, 24), page=1))
     assert first not in "\n".join(texts(monitor, (80, 24), page=2))
@@ -140,15 +151,11 @@ def test_charts_of_one_esc_use_the_available_height(size: tuple[int, int]) -> No
 
 
 def test_charts_keep_their_height_when_errors_appear() -> None:
-    places = [
-        [
-            i
-            for i, text in enumerate(texts(seen(1, kind), (80, 60)))
-            if text.startswith(tuple(LABELS))
-        ]
-        for kind in ("good", "errors")
-    ]
-    assert places[0] == places[1]
+    def places(kind: str) -> list[int]:
+        lines = texts(seen(1, kind), (80, 60))
+        return [at for at, text in enumerate(lines) if text.startswith(tuple(LABELS))]
+
+    assert places("good") == places("errors")
 
 
 @pytest.mark.parametrize(("size", "lines"), [((80, 24), 1), ((80, 50), 4), ((120, 60), 5)])
@@ -156,9 +163,8 @@ def test_the_histories_of_all_escs_are_shown_below_their_table(
     size: tuple[int, int], lines: int
 ) -> None:
     shown = texts(seen(2), size)
-    places = [
-        i for i, text in enumerate(shown) if re.match(r"esc[12] +(motor speed|power stage)", text)
-    ]
+    head = re.compile(r"esc[12] +(motor speed|power stage)")
+    places = [at for at, text in enumerate(shown) if head.match(text)]
     assert [re.split(r"  +", shown[place])[0] for place in places] == [
         "esc1 motor speed",
         "esc2 motor speed",
@@ -186,12 +192,10 @@ def test_long_names_do_not_hide_the_charge(kind: str, monkeypatch: pytest.Monkey
 
 def test_a_name_is_shortened_in_its_middle() -> None:
     assert shorten("left_front_1", 12) == "left_front_1"
-    assert [shorten("left_front_1", width) for width in (9, 6, 2, 1)] == [
-        "left…nt_1",
-        "lef…_1",
-        "l…",
-        "…",
-    ]
+    assert shorten("left_front_1", 9) == "left…nt_1"
+    assert shorten("left_front_1", 6) == "lef…_1"
+    assert shorten("left_front_1", 2) == "l…"
+    assert shorten("left_front_1", 1) == "…"
 
 
 def test_the_demo_is_shown_as_a_simulation() -> None:

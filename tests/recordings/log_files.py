@@ -1,9 +1,8 @@
-"""Logs of random CAN frames for the tests, written by our writer or by python-can's."""
+"""Logs of random CAN frames for the tests, written by our own writer or by python-can."""
 
 import random
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import can
 
@@ -28,30 +27,33 @@ READERS = {
 
 
 def some_frames(count: int, seed: int = 1, fd: bool = False) -> list[Item]:
-    """Frames of both id lengths, times in whole microseconds, rising; here and there a long pause."""
+    """Return random frames with ids of both lengths.
+
+    Their times rise in whole microseconds, with some long pauses.
+    """
     chance = random.Random(seed)
     now = 0
     items = []
     for _ in range(count):
-        now += chance.randrange(1, 20_000) * 1000 * chance.choice((1,) * 30 + (1000,))
+        pause = chance.randrange(1, 20_000) * 1000
+        now += pause * chance.choice((1,) * 30 + (1000,))
         extended = chance.random() < 0.3
         is_fd = fd and chance.random() < 0.3
-        size = (
-            chance.choice((0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64))
-            if is_fd
-            else chance.randrange(9)
-        )
-        can_id = chance.randrange(1 << 29) if extended else chance.randrange(1 << 11)
-        items.append(
-            (now, CanFrame(can_id, chance.randbytes(size), extended, is_fd), chance.random() < 0.5)
-        )
+        if is_fd:
+            size = chance.choice((0, 1, 2, 7, 8, 12, 16, 20, 24, 32, 48, 64))
+        else:
+            size = chance.randrange(9)
+        can_id = chance.randrange(1 << 29 if extended else 1 << 11)
+        frame = CanFrame(can_id, chance.randbytes(size), extended, is_fd)
+        is_received = chance.random() < 0.5
+        items.append((now, frame, is_received))
     return items
 
 
 def write_log(
     path: Path, format_: str, items: list[Item], wall_start_ns: int | None = WALL_NS
 ) -> None:
-    """By our writer."""
+    """Write a log with our own writer."""
     with path.open("wb") as file:
         writer = CanLogWriter(file, format_, wall_start_ns)
         writer.write([TimedFrame(*item) for item in items])
@@ -64,29 +66,36 @@ def _layout() -> BusLayout:
 
 
 def opened(path: Path) -> Input:
-    """By our reader."""
+    """Open a log with our own reader."""
     return open_input(path, _layout())
 
 
 def read_log(path: Path) -> tuple[list[Item], list[str]]:
-    """Frames with Unix times (if the log has them), and the damage."""
+    """Return the frames with Unix times (if the log has them), and the damage."""
+    items = []
     with opened(path) as log:
-        items = [
-            ((log.wall_ns(0) or 0) + time_ns, frame, received)
-            for time_ns, frame, received in log.frames()
-        ]
+        for time_ns, frame, received in log.frames():
+            start_ns = log.wall_ns(0) or 0
+            items.append((start_ns + time_ns, frame, received))
         return items, log.damage
 
 
 def message_of(item: Item) -> can.Message:
-    """The frame as python-can has it."""
+    """Return the frame as a message of python-can."""
     time_ns, frame, received = item
-    more: dict[str, Any] = {"data": frame.data, "is_fd": frame.fd, "is_rx": received, "channel": 0}
-    return can.Message(time_ns / 1e9, frame.can_id, frame.extended, **more)
+    return can.Message(
+        time_ns / 1e9,
+        frame.can_id,
+        frame.extended,
+        data=frame.data,
+        is_fd=frame.fd,
+        is_rx=received,
+        channel=0,
+    )
 
 
 def read_by_library(path: Path, format_: str) -> list[Item]:
-    """By python-can; times to a microsecond."""
+    """Read a log with python-can. Times are rounded to a microsecond."""
     options = {"relative_timestamp": False} if format_ == "asc" else {}
     found = []
     with READERS[format_](path, **options) as reader:
@@ -97,5 +106,5 @@ def read_by_library(path: Path, format_: str) -> list[Item]:
 
 
 def at_wall(items: list[Item], wall_start_ns: int = WALL_NS) -> list[Item]:
-    """The same with Unix times."""
+    """Return the same frames with Unix times."""
     return [(wall_start_ns + time_ns, frame, received) for time_ns, frame, received in items]

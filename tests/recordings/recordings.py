@@ -1,4 +1,7 @@
-"""Recordings to convert: a capture of two ESCs, a CAN log, plain bytes. Made once a session."""
+"""Recordings to convert: a capture of two ESCs, a CAN log and plain bytes.
+
+Each is made once in a test session.
+"""
 
 from collections.abc import Sequence
 from functools import cache
@@ -16,7 +19,7 @@ WALL_NS = 1_700_000_000 * SECOND + 250_000_000
 
 
 def convert(*words: object) -> int:
-    """Run the command in this process; its exit code."""
+    """Run ``convert`` in this process and return its exit code."""
     return main(["convert", *map(str, words)])
 
 
@@ -24,14 +27,17 @@ def convert(*words: object) -> int:
 def capture_bytes(
     escs: int = 2, seed: int = 3, seconds: float = 6, devices: Sequence[str] = ()
 ) -> bytes:
-    """A capture file in which everything happens. ``devices``: what is learnt of the ESCs at its end."""
+    """Return a capture file with all kinds of events.
+
+    ``devices`` are the names of the ESCs' devices, which are written at its end.
+    """
     bench = Bench(*made(escs)).live(seed, seconds)
     return capture_file(bench.setup, bench.entries, devices, wall_ns=WALL_NS)
 
 
 @cache
 def dump_bytes(seconds: float = 4, faults: bool = False) -> bytes:
-    """The bytes of one ESC."""
+    """Return the bytes of one ESC."""
     spoilt = Faults(flipped_bits=0.0005) if faults else Faults()
     esc = SimulatedEsc(EscOptions(device=Device.KOSMIK, faults=spoilt), seed=5)
     return b"".join(sent.wire for sent in esc.frames_until(int(seconds * SECOND)))
@@ -43,6 +49,6 @@ def _flown() -> Timed:
 
 
 def candump_log(path: Path, times: int = 1) -> Path:
-    """What an ESC's gateway sends in 3 s, as ``candump -L`` has it; so many ``times`` over."""
+    """Write the frames of a gateway in 3 s as ``candump -L`` does, several times in a row."""
     path.write_text(write_log(path, _flown()).read_text() * times)
     return path

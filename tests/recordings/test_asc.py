@@ -1,4 +1,4 @@
-"""What Vector's tools write into ASC files is read as it is meant."""
+"""ASC files as written by the tools of Vector."""
 
 from datetime import datetime
 from pathlib import Path
@@ -28,10 +28,10 @@ def test_the_start_line_of_a_can_fd_measurement_is_not_a_frame(tmp_path: Path) -
     found = _read(
         path,
         "0.000000 CANFD   Start of measurement",
-        "0.010000 CANFD   1 Rx        688                                   0 0 8 8 00 00 00 C4 09 00 14 00"
-        + FD_TAIL,
-        "0.020000 CANFD   1 Tx        12345x  EscLive                       1 0 9 12 00 01 02 03 04 05 06 07 08 09 0A 0B"
-        + FD_TAIL,
+        "0.010000 CANFD   1 Rx        688                                   "
+        "0 0 8 8 00 00 00 C4 09 00 14 00" + FD_TAIL,
+        "0.020000 CANFD   1 Tx        12345x  EscLive                       "
+        "1 0 9 12 00 01 02 03 04 05 06 07 08 09 0A 0B" + FD_TAIL,
     )
     assert found == [
         (10, CanFrame(0x688, LIVE, fd=True), True),
@@ -98,8 +98,8 @@ def test_a_request_to_send_is_not_a_second_frame(tmp_path: Path) -> None:
         ("10:15:42.400 AM", "36942.900000", "10:15:42.900"),  # since midnight
         ("10:15:42.400 AM", "36900.000000", "10:15:00.000"),  # before the beginning of the block
         ("10:15:42.400 AM", "0.500000", "10:15:42.900"),
-        ("10:15:42.400 AM", "1200.000000", "10:35:42.400"),  # nothing came for 20 min
-        ("10:20:42.400 AM", "297.000000", "10:20:39.400"),  # since the date; a trigger came later
+        ("10:15:42.400 AM", "1200.000000", "10:35:42.400"),  # the first frame after 20 min
+        ("10:20:42.400 AM", "297.000000", "10:20:39.400"),  # since the date, not the trigger
         ("10:16:12.400 AM", "0.250000", "10:16:12.650"),  # since the beginning of the block
     ],
 )

@@ -1,4 +1,4 @@
-"""CAN logs are written as python-can reads them and read as python-can writes them, frame by frame, to the microsecond."""
+"""CAN logs are written and read as by python-can, frame by frame and to the microsecond."""
 
 from pathlib import Path
 
@@ -49,7 +49,7 @@ def test_a_log_written_by_python_can_is_read(tmp_path: Path, format_: str) -> No
     assert damage == []
     assert [item[1:] for item in found] == [item[1:] for item in items]
     if format_ == "asc":
-        # python-can's header of 5 ms says 500: the start may be wrong, the distances are not
+        # python-can writes 5 ms as 500 in the header. The start may be wrong, not the distances.
         shift = found[0][0] - items[0][0]
         found = [(time_ns - shift, *rest) for time_ns, *rest in found]  # type: ignore[misc]
     assert max(abs(a[0] - b[0]) for a, b in zip(found, items, strict=True)) <= 1000
@@ -115,7 +115,8 @@ def test_the_content_decides_on_the_format_and_not_the_suffix(tmp_path: Path) ->
 
 
 def test_can_fd_frames_are_left_out_of_trc_with_a_warning(tmp_path: Path) -> None:
-    some, source = some_frames(100, fd=True), tmp_path / "fd.log"
+    some = some_frames(100, fd=True)
+    source = tmp_path / "fd.log"
     write_log(source, "candump", some)
     said = run("convert", source, tmp_path / "fd.trc").err
     wide = sum(frame.fd for _, frame, _ in some)
@@ -125,13 +126,15 @@ def test_can_fd_frames_are_left_out_of_trc_with_a_warning(tmp_path: Path) -> Non
 
 
 def test_a_part_has_all_frames_of_a_log_whose_interfaces_are_not_in_order(tmp_path: Path) -> None:
-    """Those of the second interface stand up to a second behind their time."""
+    """The frames of the second interface are stored up to a second too late."""
     lines = []
     for ms in range(0, 6000, 5):
         lines.append(f"({1_700_000_000 + ms / 1000:.6f}) can0 100#{ms:04X}")
-        if ms >= 800:
-            lines.append(f"({1_700_000_000 + (ms - 800) / 1000:.6f}) can1 101#{ms - 800:04X}")
-    source, part = tmp_path / "two.log", tmp_path / "part.log"
+        earlier = ms - 800
+        if earlier >= 0:
+            lines.append(f"({1_700_000_000 + earlier / 1000:.6f}) can1 101#{earlier:04X}")
+    source = tmp_path / "two.log"
+    part = tmp_path / "part.log"
     source.write_text("\n".join(lines) + "\n")
     run("convert", source, part, "--from", "1", "--until", "3")
     found = [(frame.can_id, int.from_bytes(frame.data)) for _, frame, _ in read_log(part)[0]]

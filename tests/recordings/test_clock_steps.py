@@ -1,4 +1,4 @@
-"""A clock that was set while the recording was made leaves the spacing of the frames as it was."""
+"""The spacing of frames does not change if the clock was set during the recording."""
 
 import csv
 import re
@@ -25,17 +25,18 @@ SET_BACK = "the clock was set back by 1 h 00 min 00 s after {} s; times continue
 
 
 def _cyclic(count: int, period_ns: int = 10 * MS) -> list[Item]:
-    """Two messages each period; the second one 2 ms after the first."""
+    """Return two messages for each period, the second one 2 ms after the first."""
     items: list[Item] = []
     for number in range(count):
         now = number * period_ns
-        items.append((now, CanFrame(0x688, bytes((number & 255,) * 8)), True))
-        items.append((now + 2 * MS, CanFrame(0x690, bytes((number & 255,) * 8)), True))
+        data = bytes((number & 255,) * 8)
+        items.append((now, CanFrame(0x688, data), True))
+        items.append((now + 2 * MS, CanFrame(0x690, data), True))
     return items
 
 
 def _moved(items: list[Item], by_ns: Callable[[int], int]) -> list[Item]:
-    """The same frames, at times that are later by ``by_ns`` of each."""
+    """Return the same frames, each delayed by ``by_ns`` of its time."""
     return [(time_ns + by_ns(time_ns), *rest) for time_ns, *rest in items]  # type: ignore[misc]
 
 
@@ -71,7 +72,7 @@ def test_spacing_continues_when_the_clock_is_set_back(tmp_path: Path, format_: s
 
 
 def _with_clock_set_back(log: Path, path: Path) -> Path:
-    """The candump log, the clock of which is set back by an hour after 1.5 s."""
+    """Write a copy of a candump log whose clock was set back by an hour after 1.5 s."""
     first: list[float] = []
 
     def moved(found: "re.Match[str]") -> str:
@@ -121,8 +122,10 @@ def test_tables_reports_and_logs_are_as_with_a_steady_clock(tmp_path: Path) -> N
 def _read(
     times: list[int], ids: Callable[[int], int] = lambda _: 0x100
 ) -> tuple[list[int], LogClock]:
-    """The continuous times, in ms, of frames at these times."""
-    frames = [LogFrame(t * MS, CanFrame(ids(n), b"")) for n, t in enumerate(times)]
+    """Read frames with these times in ms, and return their continuous times in ms."""
+    frames = []
+    for number, time_ms in enumerate(times):
+        frames.append(LogFrame(time_ms * MS, CanFrame(ids(number), b"")))
     clock = LogClock(frames)
     return [item.time_ns // MS for item in clock.frames()], clock
 
@@ -133,7 +136,7 @@ def _read(
 def test_ten_frames_that_go_back_by_more_than_100_ms_are_a_step(
     count: int, by_ms: int, is_step: bool
 ) -> None:
-    """Each of ten frames at a period of 1 ms, which follow one at 100 ms."""
+    """The frames have a period of 1 ms and follow a frame at 100 ms."""
     before = list(range(101))
     back = [101 + number - by_ms for number in range(count)]
     found, clock = _read([*before, *back, 200])
@@ -154,13 +157,14 @@ def test_a_second_step_adds_to_the_first() -> None:
 
 
 def test_the_gap_at_a_step_is_taken_from_the_periods_of_the_ids() -> None:
-    """Frame 0x200 comes every 100 ms, in between 0x100 every 10 ms; the step falls before a 0x200."""
-    even = sorted(
-        [*((t, 0x100) for t in range(0, 1000, 10)), *((t + 3, 0x200) for t in range(0, 1000, 100))]
-    )
-    times = [t if t < 503 else t - 400 for t, _ in even]
-    found, clock = _read(times, lambda number: even[number][1])
-    assert found == [t for t, _ in even]
+    """Frame 0x200 is sent every 100 ms and 0x100 every 10 ms. The step is before a frame 0x200."""
+    fast = [(ms, 0x100) for ms in range(0, 1000, 10)]
+    slow = [(ms, 0x200) for ms in range(3, 1000, 100)]
+    frames = sorted([*fast, *slow])
+    even = [ms for ms, _ in frames]
+    times = [ms if ms < 503 else ms - 400 for ms in even]
+    found, clock = _read(times, lambda number: frames[number][1])
+    assert found == even
     assert clock.steps == [ClockStep(503 * MS, -400 * MS)]
 
 

@@ -1,6 +1,6 @@
-"""``kontronik-can-gw convert`` as people use it: what it says, and what it leaves behind when it cannot go on.
+"""Messages of ``kontronik-can-gw convert``, and the files that remain if it fails.
 
-What it makes: test_tables.py, and tests/golden/commands/convert.txt.
+Its output is tested in test_tables.py and in tests/golden/commands/convert.txt.
 """
 
 import io
@@ -22,7 +22,7 @@ PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 
 
 def program(*words: object, **options: object) -> "subprocess.CompletedProcess[str]":
-    """Run it as a process of its own."""
+    """Run ``convert`` in a new process."""
     command = [*PROGRAM, *map(str, words)]
     options = {"capture_output": True, "text": True, "timeout": 60, **options}
     return subprocess.run(command, check=False, **options)  # type: ignore[call-overload, no-any-return]
@@ -37,9 +37,11 @@ def dump(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "candump", "blf", "mf4-log"])
 def test_an_input_without_frames_is_refused_and_leaves_no_file(tmp_path: Path, form: str) -> None:
-    source, is_table = tmp_path / "other.log", form in ("csv", "jsonl", "parquet")
+    source = tmp_path / "other.log"
+    is_table = form in ("csv", "jsonl", "parquet")
+    foreign_frame = "(1700000000.000000) can0 123#00\n"
     empty = "base hex  timestamps absolute\n"
-    source.write_text("(1700000000.000000) can0 123#00\n" if is_table else empty)
+    source.write_text(foreign_frame if is_table else empty)
     said = refused(1, "convert", source, tmp_path / "out", "--to", form)
     assert f"{source}: nothing in it can be converted" in said
     assert "--dbc" in said or not is_table
@@ -69,7 +71,8 @@ def test_a_full_disk_is_reported_in_one_line_and_leaves_no_file(
     def small() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
 
-    for more in ([], ["--until", "0.3"]):  # in the midst, and what Python holds to the end
+    # the disk is full in the middle of the file, or when Python flushes its buffer at the end
+    for more in ([], ["--until", "0.3"]):
         done = program(dump, tmp_path / "out", "--to", form, *more, preexec_fn=small)
         assert done.returncode == 1, done.stderr
         said = f"kontronik-can-gw convert: {tmp_path / 'out'}: cannot be written: File too large.\n"
@@ -84,11 +87,10 @@ def test_a_full_disk_is_reported_in_one_line_and_leaves_no_file(
 def test_a_signal_leaves_no_incomplete_file(
     tmp_path: Path, form: str, number: signal.Signals
 ) -> None:
-    # far more than is done before the signal comes
+    # the log is long enough for the signal to arrive before its end
     source = candump_log(tmp_path / "long.log", 100)
-    process = subprocess.Popen(
-        [*PROGRAM, source, tmp_path / "out", "--to", form], stderr=subprocess.PIPE, text=True
-    )
+    command = [*PROGRAM, source, tmp_path / "out", "--to", form]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     while process.poll() is None and not (tmp_path / "out.part").exists():
         time.sleep(0.001)
     process.send_signal(number)
@@ -109,4 +111,7 @@ def test_a_long_conversion_shows_its_progress_on_a_terminal(
         blocks = [[1, 2], [3]]
         assert [*watched(blocks, "flight.kcap to csv:", data_on_screen=False)] == blocks
         shown = re.search(r"flight\.kcap to csv: \D*3\b", screen.getvalue())
-        assert shown if on_terminal else not screen.getvalue()
+        if on_terminal:
+            assert shown
+        else:
+            assert not screen.getvalue()

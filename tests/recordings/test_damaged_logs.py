@@ -1,6 +1,6 @@
-"""Of a damaged log everything that is intact is given (of BLF and MF4 what is before the damage), and the damage is told.
+"""All intact frames of a damaged log are read, and the damage is reported.
 
-Nothing raises but RunError.
+Of BLF and MF4 only the frames before the damage are read. The only exception is UserError.
 """
 
 import random
@@ -26,7 +26,7 @@ def _log(tmp_path: Path, format_: str, count: int) -> tuple[Path, list[Item], by
 
 
 def _is_part(found: list[Item], items: list[Item]) -> bool:
-    """True where ``found`` is ``items`` with some left out."""
+    """Return True if ``found`` is ``items`` without some of them, in the same order."""
     rest = iter(items)
     return all(any(item == other for other in rest) for item in found)
 
@@ -43,8 +43,9 @@ def test_a_cut_file_gives_all_frames_before_the_cut(tmp_path: Path, format_: str
             continue
         if format_ in TEXT:
             assert len(found) >= min(content[:cut].count(b"\n") - others, len(items))
-            # of a line that is cut a shorter number may be left, which nobody can tell
-            found = found if content[:cut].endswith(b"\n") else found[:-1]
+            if not content[:cut].endswith(b"\n"):
+                # the last number of a cut line may be shorter, which cannot be detected
+                found = found[:-1]
         else:
             assert damage
         assert [item[1:] for item in found] == [item[1:] for item in items[: len(found)]]
@@ -72,7 +73,8 @@ def test_rubbish_between_lines_loses_no_frame(tmp_path: Path, format_: str, rubb
         (35, b"\x10", slice(9, 10), "1 damaged frame left out"),
         (8, struct.pack("<L", 5000), slice(9, 30), "the last frame is cut off"),
         *(
-            (8, struct.pack("<L", n), slice(9, 30), f"damaged after 9 frames (an object of {n} bytes)")
+            (8, struct.pack("<L", n), slice(9, 30),
+             f"damaged after 9 frames (an object of {n} bytes)")
             for n in (0, 31, (1 << 20) + 1, 0xFFFFFFFF)
         ),
     ],
@@ -80,16 +82,15 @@ def test_rubbish_between_lines_loses_no_frame(tmp_path: Path, format_: str, rubb
 def test_frames_before_the_damage_of_a_blf_file_are_read(
     tmp_path: Path, place: int, bits: bytes, lost: slice, told: str
 ) -> None:
-    """python-can alone reads an object of size 0 for ever, and takes a DLC of 16 for a frame."""
+    """python-can alone never ends at an object of size 0, and accepts a frame with a DLC of 16."""
     items = at_wall(some_frames(30))
     path = tmp_path / "log.blf"
     with can.BLFWriter(path, compression_level=0) as writer:
         for item in items:
             writer.on_message_received(message_of(item))
     content = bytearray(path.read_bytes())
-    at = [found.start() for found in re.finditer(b"LOBJ", content)][
-        10
-    ]  # the first is the container
+    objects = [found.start() for found in re.finditer(b"LOBJ", content)]
+    at = objects[10]  # the tenth frame, because the first object is the container
     content[at + place : at + place + len(bits)] = bits
     path.write_bytes(content)
     found, damage = read_log(path)
@@ -106,16 +107,17 @@ def test_no_damage_raises_anything_but_a_user_error(tmp_path: Path, format_: str
     for _ in range(15 if format_ == "mf4" else 200):
         damaged = bytearray(content)
         for _ in range(chance.choice((1, 1, 3, 20))):
-            at, most = chance.randrange(len(damaged)), chance.randrange(40)
+            at = chance.randrange(len(damaged))
+            most = chance.randrange(40)
             flipped = bytes((damaged[at] ^ 1 << chance.randrange(8),))
-            damaged[at : at + chance.choice((1, 0, most))] = chance.choice(
-                (flipped, chance.randbytes(most), b"")
-            )
+            instead = chance.choice((flipped, chance.randbytes(most), b""))
+            replaced = chance.choice((1, 0, most))
+            damaged[at : at + replaced] = instead
         path.write_bytes(damaged)
         problem = ""
         try:
             read_log(path)
-        except UserError as error:  # nothing is left of what the format begins with
+        except UserError as error:  # the head of the file is damaged
             problem = str(error)
         assert "\n" not in problem
 
@@ -131,10 +133,11 @@ def test_no_damage_raises_anything_but_a_user_error(tmp_path: Path, format_: str
 def test_a_time_far_away_is_accepted_if_the_next_time_agrees(
     tmp_path: Path, moved: dict[int, int], lost: list[int]
 ) -> None:
-    """``moved``: by how many days."""
+    """``moved`` has the days by which the times of frames are wrong."""
     items = at_wall(some_frames(30))
     for number, days in moved.items():
-        items[number] = (items[number][0] + days * 86_400 * 10**9, *items[number][1:])
+        time_ns, *rest = items[number]
+        items[number] = (time_ns + days * 86_400 * 10**9, *rest)  # type: ignore[assignment]
     path = tmp_path / "log.log"
     write_log(path, "candump", items, 0)
     found, damage = read_log(path)
@@ -144,7 +147,7 @@ def test_a_time_far_away_is_accepted_if_the_next_time_agrees(
 
 @pytest.mark.parametrize("size", [15, 0x7FFFFFFF, 0xFFFFFFFF])
 def test_a_container_of_an_impossible_size_is_reported_as_damage(tmp_path: Path, size: int) -> None:
-    """python-can takes all the rest for it, of which it unpacks the first."""
+    """python-can reads the rest of the file as one container, and unpacks the first one in it."""
     items = at_wall(some_frames(9_000))
     path = tmp_path / "log.blf"
     write_log(path, "blf", some_frames(9_000))
@@ -172,8 +175,9 @@ TRC = ";$FILEVERSION={}\n;$STARTTIME=45244.0\n;$COLUMNS=N,O,T,I,d,L,D\n{}\n"
 )
 def test_a_trc_line_with_an_impossible_time_or_length_is_damaged(tmp_path: Path, line: str) -> None:
     path = tmp_path / "log.trc"
-    lines = "1 1.0 DT 0123 Rx 1 11", line, "3 3.0 FD 0124 Rx 15 " + "22 " * 64
-    path.write_text(TRC.format("2.1", "\n".join(lines)))
+    last = "3 3.0 FD 0124 Rx 15 " + "22 " * 64
+    lines = f"1 1.0 DT 0123 Rx 1 11\n{line}\n{last}"
+    path.write_text(TRC.format("2.1", lines))
     found, damage = read_log(path)
     assert [item[1].data for item in found] == [b"\x11", b"\x22" * 64]
     assert damage == ["1 damaged line: 5"]

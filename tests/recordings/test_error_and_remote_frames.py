@@ -32,10 +32,14 @@ def _logged(path: Path) -> list[LogFrame]:
 
 
 def _kinds(found: list[LogFrame]) -> list[tuple[str, int, bytes]]:
-    """Kind, id and data; of an error frame only the kind."""
-    return [
-        (item.kind, *((0, b"") if item.frame.can_id & ERROR else item.frame[:2])) for item in found
-    ]
+    """Return the kind, the id and the data of frames. Error frames have no id and no data here."""
+    kinds = []
+    for item in found:
+        if item.frame.can_id & ERROR:
+            kinds.append((item.kind, 0, b""))
+        else:
+            kinds.append((item.kind, item.frame.can_id, item.frame.data))
+    return kinds
 
 
 @pytest.mark.parametrize("format_", sorted(READERS))
@@ -111,8 +115,10 @@ def test_asc_lines_with_error_and_remote_frames_are_read(tmp_path: Path) -> None
         "date Wed Nov 15 10:13:20.250 am 2023\n"
         "base hex  timestamps absolute\n"
         "   0.001 1  ErrorFrame\n"
-        "   0.002 2 ErrorFrame Flags = 0xe CodeExt = 0x20a2 Code = 0x82 ID = 0 DLC = 0 Position = 5\n"
-        "   0.003 CANFD   1 Rx  ErrorFrame  Not Acknowledge error, dominant error flag fffe c7 31ca Arb.\n"
+        "   0.002 2 ErrorFrame Flags = 0xe CodeExt = 0x20a2 "
+        "Code = 0x82 ID = 0 DLC = 0 Position = 5\n"
+        "   0.003 CANFD   1 Rx  ErrorFrame  "
+        "Not Acknowledge error, dominant error flag fffe c7 31ca Arb.\n"
         "   0.004 1  681             Rx   r\n"
         "   0.005 1  12345x          Tx   r 8 Length = 1704000 BitCount = 145 ID = 74565x\n"
         "   0.006 CANFD   2 Tx   681  0 0 4 0  0 0 0 0 0 0 0 0\n"
@@ -135,8 +141,10 @@ def test_asc_lines_with_error_and_remote_frames_are_read(tmp_path: Path) -> None
         ("", "  1)  1842  0008  4  ERROR  00 19 08 08", "1"),
         (";$FILEVERSION=1.1\n", "  1)  1842.0  Error  0008  4  00 19 08 08", "1"),
         (";$FILEVERSION=1.3\n", "  1)  1842.0 2  Error  0008  -  4  00 19 08 08", "2"),
-        (";$FILEVERSION=2.0\n;$COLUMNS=N,O,T,I,d,l,D\n", "1 1842.000 ER - Rx 5 04 00 02 00 00", "1"),
-        (";$FILEVERSION=2.1\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n", "1 1842.000 ER 3 - Rx - 5 04 00 02 00 00", "3"),
+        (";$FILEVERSION=2.0\n;$COLUMNS=N,O,T,I,d,l,D\n",
+         "1 1842.000 ER - Rx 5 04 00 02 00 00", "1"),
+        (";$FILEVERSION=2.1\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n",
+         "1 1842.000 ER 3 - Rx - 5 04 00 02 00 00", "3"),
     ],
 )  # fmt: skip
 def test_error_frames_of_trc_are_read(tmp_path: Path, head: str, line: str, channel: str) -> None:
@@ -150,7 +158,7 @@ def test_error_frames_of_trc_are_read(tmp_path: Path, head: str, line: str, chan
 
 @pytest.mark.parametrize("kind", [2, 104])
 def test_error_objects_of_blf_that_python_can_skips_are_read(tmp_path: Path, kind: int) -> None:
-    """CAN_ERROR begins with a channel of two bytes, CAN_FD_ERROR_64 with one byte."""
+    """CAN_ERROR begins with a channel of two bytes, CAN_FD_ERROR_64 with a channel of one byte."""
     path = tmp_path / "log.blf"
     data = bytes((2, 0, 1, 0, 0, 0, 0, 0)) if kind == 2 else bytes((2, *range(1, 46)))
     with can.BLFWriter(path, max_container_size=150) as writer:
@@ -168,13 +176,10 @@ def test_error_objects_of_blf_that_python_can_skips_are_read(tmp_path: Path, kin
                 writer._buffer_size += len(writer._buffer[-1])
                 writer._flush()
     found = _logged(path)
-    assert [(item.kind, item.channel) for item in found] == [
-        ("CAN frame", "2"),
-        ("error frame", "2"),
-    ] * 6
-    assert [round(item.time_ns / MS) for item in found] == [
-        number * 10 + part for number in range(6) for part in (0, 1)
-    ]
+    kinds = [(item.kind, item.channel) for item in found]
+    assert kinds == [("CAN frame", "2"), ("error frame", "2")] * 6
+    times = [round(item.time_ns / MS) for item in found]
+    assert times == [0, 1, 10, 11, 20, 21, 30, 31, 40, 41, 50, 51]
 
 
 def test_remote_frames_of_a_capture_are_remote_frames_in_a_log(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What is no recording, and what is said where a log is of more ESCs than its DBC."""
+"""Messages about files that are not recordings, and about logs with more ESCs than their DBC."""
 
 from pathlib import Path
 
@@ -64,7 +64,8 @@ def test_candumps_screen_output_is_refused_with_the_right_command(
 
 
 def test_decode_refuses_files_that_are_not_the_bytes_of_an_esc(tmp_path: Path) -> None:
-    noise, empty = tmp_path / "noise.bin", tmp_path / "empty.bin"
+    noise = tmp_path / "noise.bin"
+    empty = tmp_path / "empty.bin"
     log = write_log(tmp_path / "bus.log", flight(layout_of(["a"]), 1))
     noise.write_bytes(b"no recording" * 9)
     empty.touch()

@@ -1,4 +1,7 @@
-"""Plain bytes of one ESC: every frame that brute force finds is a row at its assumed time, whatever stands between the frames."""
+"""Plain bytes of one ESC: every frame found by brute force is a row at its assumed time.
+
+Any bytes may be between the frames.
+"""
 
 import random
 import struct
@@ -30,7 +33,11 @@ STREAMS: dict[str, Callable[[random.Random], bytes]] = {
 
 
 def assumed_times(found: list[Found]) -> list[int]:
-    """A live frame each period, an info frame half a period before the next live frame, never back in time."""
+    """Return the times of frames in a file of plain bytes, which has no times.
+
+    A live frame follows each period. An info frame is half a period before the next live frame,
+    but not earlier than the frame before it.
+    """
     times: list[int] = []
     lives = 0
     for frame in found:
@@ -38,7 +45,8 @@ def assumed_times(found: list[Found]) -> list[int]:
             times.append(lives * PERIOD_NS)
             lives += 1
         else:
-            times.append(max(times[-1] if times else 0, lives * PERIOD_NS - PERIOD_NS // 2))
+            before = times[-1] if times else 0
+            times.append(max(before, lives * PERIOD_NS - PERIOD_NS // 2))
     return times
 
 
@@ -47,16 +55,18 @@ def assumed_times(found: list[Found]) -> list[int]:
 def test_rows_are_exactly_the_frames_found_by_brute_force(
     tmp_path: Path, kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However the file is read: small reads put every limit of a read anywhere in a frame and in rubbish."""
+    """With small reads, a read may end anywhere in a frame or in rubbish."""
     source = random.Random(f"{kind} {seed}")
     monkeypatch.setattr(bytes_input, "CHUNK", source.choice([1, 7, 44, 100, 5000, 1 << 18]))
     stream = STREAMS[kind](source)
-    (path := tmp_path / "esc.bin").write_bytes(stream)
+    path = tmp_path / "esc.bin"
+    path.write_bytes(stream)
     dump = BytesInput(path)
     found = frames_of(stream)
     times = assumed_times(found)
 
-    at, ends = 0, {}
+    at = 0
+    ends = {}
     for entry in dump.entries():
         if entry.kind == Kind.BYTES:
             assert entry.data
@@ -65,20 +75,22 @@ def test_rows_are_exactly_the_frames_found_by_brute_force(
     assert at == len(stream)
     assert [ends[frame.end] for frame in found] == times
 
-    lives = [
-        (time_ns, struct.unpack_from(LIVE_STRUCT, frame.raw, 4))
-        for frame, time_ns in zip(found, times, strict=True)
-        if frame.kind == "live"
-    ]
+    expected = []
+    for frame, time_ns in zip(found, times, strict=True):
+        if frame.kind == "live":
+            speed, volts, amperes, *_ = struct.unpack_from(LIVE_STRUCT, frame.raw, 4)
+            expected.append((time_ns, (speed, volts / 100, amperes / 10)))
     names = [field.name for field in dump.fields]
-    rows = list(dump.samples([names.index(name) for name in NAMES]))
-    assert [row.values for row in rows] == [
-        (data[0], data[1] / 100, data[2] / 10) for _, data in lives
-    ]
-    assert [row.time_ns for row in rows] == [time_ns for time_ns, _ in lives]
+    rows = dump.samples([names.index(name) for name in NAMES])
+    assert [(row.time_ns, row.values) for row in rows] == expected
     dropped = len(stream) - sum(len(frame.raw) for frame in found)
     told = [line.split()[0] for line in dump.damage if "belong to no frame" in line]
     assert told == ([str(dropped)] if dropped else [])
+
+
+def _time_of(line: str) -> float:
+    """Return the time of a line of a candump log, in seconds."""
+    return float(line[1:].partition(")")[0])
 
 
 @pytest.mark.parametrize(
@@ -89,11 +101,16 @@ def test_a_part_of_plain_bytes_has_the_frames_of_the_whole_at_its_times(
 ) -> None:
     source = tmp_path / "esc.bin"
     source.write_bytes(dump_bytes(15, faults=True))
-    options = [*(["--from", start] if start else []), *(["--until", end] if end else [])]
+    options = []
+    if start:
+        options += ["--from", start]
+    if end:
+        options += ["--until", end]
     assert convert("-q", source, tmp_path / "all.log") == 0
     assert convert("-q", source, tmp_path / "part.log", *options) == 0
     lines = (tmp_path / "all.log").read_text().splitlines()
-    low, high = float(start or 0), float(end or 1e9)
-    wanted = [line for line in lines if low <= float(line[1:].partition(")")[0]) <= high]
+    low = float(start or 0)
+    high = float(end or 1e9)
+    wanted = [line for line in lines if low <= _time_of(line) <= high]
     assert len(lines) > len(wanted) > 0
     assert (tmp_path / "part.log").read_text().splitlines() == wanted

@@ -1,4 +1,7 @@
-"""The ESC's pseudo terminal: bytes pass unchanged one way, and an echo is noticed (what a gateway sends: tests/cli)."""
+"""The pseudo terminal of a simulated ESC: bytes pass unchanged, and an echo is noticed.
+
+Bytes that a gateway sends to the ESC are tested in tests/cli.
+"""
 
 import os
 import termios
@@ -48,7 +51,7 @@ def test_every_byte_passes_and_an_echo_is_noticed(
 def test_unread_bytes_are_dropped_and_counted_and_never_block(esc: PtyEsc) -> None:
     written = refused = 0
     while refused < 20:
-        # the kernel moves bytes between its buffers meanwhile, so some may be taken after a refusal
+        # the kernel moves bytes between its buffers, so it may accept some after a refusal
         refused += not esc.write(bytes(1000))
         written += 1000
         assert written < 10_000_000

@@ -1,4 +1,4 @@
-"""Recordings through pipes: rows appear as their data arrive, and a signal keeps the rows so far."""
+"""Recordings through pipes: rows appear as their data arrive, and a signal keeps their rows."""
 
 import array
 import fcntl
@@ -32,7 +32,7 @@ FORMATS = {"candump": ".log", "asc": ".asc", "blf": ".blf", "trc": ".trc", "mf4-
 
 @contextmanager
 def started(*words: object, **options: object) -> Iterator["subprocess.Popen[bytes]"]:
-    """A command whose standard input and output are pipes."""
+    """Start a command whose standard input and output are pipes."""
     command = [*PROGRAM, *map(str, words)]
     every = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, **every | options) as process:  # type: ignore[call-overload]
@@ -50,7 +50,7 @@ def send(process: "subprocess.Popen[bytes]", data: bytes) -> None:
 
 
 def lines_from(process: "subprocess.Popen[bytes]", count: int) -> list[bytes]:
-    """The next lines of a command's output. Fails if it hangs."""
+    """Return the next lines of a command's output. Fails if the command hangs."""
     assert process.stdout is not None
     found = b""
     while found.count(b"\n") < count:
@@ -62,7 +62,7 @@ def lines_from(process: "subprocess.Popen[bytes]", count: int) -> list[bytes]:
 
 
 def ended(process: "subprocess.Popen[bytes]") -> tuple[int, str]:
-    """Exit code and messages of a command that ends."""
+    """Wait for the end of a command. Returns its exit code and its messages."""
     _, messages = process.communicate(timeout=_HUNG_S)
     return process.returncode, messages.decode()
 
@@ -72,7 +72,7 @@ def candump_lines(tmp_path: Path) -> list[bytes]:
 
 
 def rows_of(source: Path) -> list[bytes]:
-    """Header and rows of a recording as CSV."""
+    """Return the header and the rows of a recording as CSV."""
     target = source.with_suffix(".expected")
     assert convert("-q", source, target, "--to", "csv") == 0
     return target.read_bytes().splitlines()
@@ -95,13 +95,14 @@ def test_rows_of_candump_appear_before_the_stream_ends(tmp_path: Path) -> None:
 
 
 def _ends_row(lines: list[bytes], number: int) -> bool:
-    """True if an id of the row before comes again in this line."""
+    """Return True if the id of this line was in a line before, so that a new row begins."""
     ids = [line.split()[2].partition(b"#")[0] for line in lines[: number + 1]]
     return ids[-1] in ids[:-1]
 
 
 def test_rows_of_uart_bytes_appear_one_frame_later(tmp_path: Path) -> None:
-    (source := tmp_path / "esc.bytes").write_bytes(dump_bytes())
+    source = tmp_path / "esc.bytes"
+    source.write_bytes(dump_bytes())
     frames = [b"KOD" + frame for frame in dump_bytes().split(b"KOD")[1:]]
     expected = rows_of(source)
     with started("decode", "-", "--csv") as process:
@@ -116,10 +117,12 @@ def test_rows_of_uart_bytes_appear_one_frame_later(tmp_path: Path) -> None:
 
 def make_source(tmp_path: Path, kind: str) -> Path:
     if kind == "capture":
-        (source := tmp_path / "flight.kcap").write_bytes(capture_bytes())
+        source = tmp_path / "flight.kcap"
+        source.write_bytes(capture_bytes())
         return source
     if kind == "bytes":
-        (source := tmp_path / "esc.bytes").write_bytes(dump_bytes(faults=True))
+        source = tmp_path / "esc.bytes"
+        source.write_bytes(dump_bytes(faults=True))
         return source
     log = candump_log(tmp_path / "flight.log")
     if kind == "candump":

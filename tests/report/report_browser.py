@@ -1,4 +1,7 @@
-"""A headless Chromium, driven over the DevTools protocol through a pair of pipes: no driver, no port, no library."""
+"""A headless Chromium, controlled with the DevTools protocol through a pair of pipes.
+
+So the tests need neither a driver, nor a port, nor a library.
+"""
 
 import json
 import os
@@ -17,14 +20,19 @@ PROGRAM = (
 )
 MISSING = "no Chromium: apt-get install chromium, or give its path in the variable CHROMIUM"
 OPTIONS = """
-    --headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking
-    --disable-component-update --disable-sync --disable-dev-shm-usage --hide-scrollbars --remote-debugging-pipe
+    --headless --no-sandbox --disable-gpu --disable-quic --no-first-run
+    --disable-background-networking --disable-component-update --disable-sync
+    --disable-dev-shm-usage --hide-scrollbars --remote-debugging-pipe
 """
 _TIMEOUT_S = 60
 
 
 class Browser:
-    """One page of one browser. ``errors``: errors that scripts threw or the console reported; ``requests``: addresses asked for."""
+    """One page of one browser.
+
+    ``errors`` are exceptions of scripts and errors on the console. ``requests`` are the addresses
+    of all files that the page loaded.
+    """
 
     def __init__(self, profile: Path) -> None:
         assert PROGRAM is not None, MISSING
@@ -65,7 +73,7 @@ class Browser:
         os.close(self._in)
 
     def call(self, method: str, **params: object) -> dict[str, Any]:
-        """One command of the protocol; its result."""
+        """Send a command of the protocol and return its result."""
         self._number += 1
         message: dict[str, object] = {"id": self._number, "method": method, "params": params}
         if self._session is not None:
@@ -85,7 +93,7 @@ class Browser:
             left = max(0.0, end - time.monotonic())
             assert select.select([self._in], [], [], left)[0], "the browser does not answer"
             data = os.read(self._in, 1 << 20)
-            assert data, "the browser has gone"
+            assert data, "the browser has ended"
             self._buffer += data
         text, _, self._buffer = self._buffer.partition(b"\0")
         message: dict[str, Any] = json.loads(text)
@@ -131,12 +139,12 @@ class Browser:
         self.settle()
 
     def settle(self) -> None:
-        """Two frames are drawn."""
+        """Wait until two frames are drawn."""
         frame = "await new Promise(requestAnimationFrame);"
         self.run(f"(async () => {{ {frame} {frame} }})()")
 
     def run(self, script: str) -> Any:
-        """The value of an expression (of a promise: what it becomes)."""
+        """Return the value of an expression. A promise is awaited."""
         found = self.call(
             "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
         )
@@ -144,7 +152,7 @@ class Browser:
         return found["result"].get("value")
 
     def mouse(self, kind: str, x: float, y: float, buttons: int = 0) -> None:
-        """One event: ``Moved``, ``Pressed`` or ``Released``."""
+        """Send an event of the mouse: ``Moved``, ``Pressed`` or ``Released``."""
         event = {"type": f"mouse{kind}", "x": x, "y": y, "buttons": buttons, "clickCount": 1}
         button = "left" if kind != "Moved" else "none"
         self.call("Input.dispatchMouseEvent", **event, button=button)

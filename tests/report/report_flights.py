@@ -1,4 +1,7 @@
-"""Simulated flights as inputs of the report: rows as ``open_input`` gives them, made by the real gateway without any file."""
+"""Simulated flights as inputs of the report.
+
+Their rows are as from ``open_input``, but they are made by the real gateway without a file.
+"""
 
 import base64
 import gzip
@@ -22,27 +25,33 @@ Row = tuple[int, list[Value]]
 
 
 def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()) -> Iterator[Row]:
-    """Simulated ESCs through the real gateway, the bus and the DBC."""
-    given = [*options, *[EscOptions()] * len(bus.escs)][: len(bus.escs)]
+    """Yield the rows of simulated ESCs, whose values pass the real gateway, the bus and the DBC."""
+    count = len(bus.escs)
+    given = [*options, *[EscOptions()] * count][:count]
     reader = SignalReader(bus.layout)
-    frames = (TimedFrame(5 * SECOND + now, frame) for now, frame in flight(bus, seconds, given))
+    frames = []
+    for now, frame in flight(bus, seconds, given):
+        frames.append(TimedFrame(5 * SECOND + now, frame))
     rows = RowsOfFrames(reader, range(len(reader.columns)))
     for times, columns in rows.blocks(frames, count=100):
-        yield from zip(times, map(list, zip(*columns, strict=True)), strict=True)
+        values = zip(*columns, strict=True)
+        yield from zip(times, map(list, values), strict=True)
 
 
 def flight_of(bus: BusLayout, rows: Iterable[Row], points: int = 2000) -> Flight:
-    """The flight of the rows of a bus."""
-    made = Flight(bus.escs, fields_of_log(SignalReader(bus.layout), bus.escs), points)
+    """Return the flight of the rows of a bus, which are given in blocks of 100."""
+    fields = fields_of_log(SignalReader(bus.layout), bus.escs)
+    made = Flight(bus.escs, fields, points)
     every = iter(rows)
     while some := list(islice(every, 100)):
         times, values = zip(*some, strict=True)
-        made.take(Block(times, [*zip(*values, strict=True)], None))
+        columns = list(zip(*values, strict=True))
+        made.take(Block(times, columns, None))
     return made.finish()
 
 
 def rows_of(bus: BusLayout, times: Sequence[int], **columns: Sequence[Value]) -> Iterator[Row]:
-    """Rows with values of the first ESC by source; the others are not available."""
+    """Yield rows with these values of the first ESC. All other values are not available."""
     count = len(SignalReader(bus.layout).columns)
     places = [(column(bus, source), values) for source, values in columns.items()]
     for number, time_ns in enumerate(times):
@@ -53,13 +62,13 @@ def rows_of(bus: BusLayout, times: Sequence[int], **columns: Sequence[Value]) ->
 
 
 def data_of(html: str) -> dict[str, Any]:
-    """The data that a page draws."""
+    """Return the data that a page draws."""
     packed = html.partition(' id="data">')[2].partition("<")[0]
     found: dict[str, Any] = json.loads(gzip.decompress(base64.b64decode(packed)))
     return found
 
 
 def column(bus: BusLayout, source: str, esc: int | None = 0) -> int:
-    """Where a source is in a row."""
+    """Return the position of a source in a row."""
     columns = [(column.source, column.esc) for column in SignalReader(bus.layout).columns]
     return columns.index((source, esc))

@@ -1,5 +1,6 @@
-"""Decimation keeps every extreme exactly and never joins over a gap, however the rows are cut into chunks."""
+"""Decimation keeps every extreme exactly and never draws over a gap, for any chunks of rows."""
 
+from collections.abc import Sequence
 from itertools import accumulate, pairwise
 
 from hypothesis import given
@@ -21,23 +22,47 @@ def test_gaps_and_extremes_are_kept_for_any_blocks_of_rows(
     decimator = Decimator(2, points)
     at = 0
     for cut in [*cuts, len(rows)]:
-        if part := rows[at : at + cut]:
-            decimator.feed(times[at : at + len(part)], list(zip(*part, strict=True)))
-        at += len(part)
+        part = rows[at : at + cut]
+        end = at + len(part)
+        if part:
+            decimator.feed(times[at:end], list(zip(*part, strict=True)))
+        at = end
     drawn = decimator.times
     assert drawn == sorted(drawn)
     assert (drawn[0], drawn[-1]) == (times[0], times[-1])
-    for before, after in zip(zip(*rows, strict=True), decimator.columns, strict=True):
-        pairs = pairwise(zip(drawn, after, strict=True))
-        lines = [(t0, t1) for (t0, a), (t1, b) in pairs if a is not None and b is not None]
-        # no line is drawn over, from or to the time of a row without value
-        missing = [time for time, value in zip(times, before, strict=True) if value is None]
-        assert not [at for at in missing for begin, end in lines if begin <= at <= end]
-        assert missing or None not in after
-        known, kept = ([v for v in values if v is not None] for values in (before, after))
-        assert set(kept) <= set(known)
-        assert not known or (min(kept), max(kept)) == (min(known), max(known))
-    edges = sum(
-        (a is None) is not (b is None) for one in zip(*rows, strict=True) for a, b in pairwise(one)
-    )
+    columns = list(zip(*rows, strict=True))
+    for before, after in zip(columns, decimator.columns, strict=True):
+        check_column(times, before, drawn, after)
+    edges = sum(map(edges_of, columns))
     assert len(drawn) <= max(points, MIN_POINTS) + 2 * edges
+
+
+def check_column(
+    times: Sequence[int],
+    before: Sequence[Number],
+    drawn: Sequence[int],
+    after: Sequence[Number],
+) -> None:
+    """Compare a column with its decimated form: times and values before and after."""
+    lines = []
+    points = zip(drawn, after, strict=True)
+    for (begin, first), (end, last) in pairwise(points):
+        if first is not None and last is not None:
+            lines.append((begin, end))
+    missing = [time for time, value in zip(times, before, strict=True) if value is None]
+    for time in missing:
+        # no line is drawn over, from or to the time of a row without a value
+        assert not any(begin <= time <= end for begin, end in lines)
+    assert missing or None not in after
+    known = [value for value in before if value is not None]
+    kept = [value for value in after if value is not None]
+    assert set(kept) <= set(known)
+    if known:
+        assert min(kept) == min(known)
+        assert max(kept) == max(known)
+
+
+def edges_of(column: Sequence[Number]) -> int:
+    """Count the changes between a value and a missing value."""
+    is_missing = [value is None for value in column]
+    return sum(before is not after for before, after in pairwise(is_missing))

@@ -1,4 +1,7 @@
-"""The summary's numbers against pandas and numpy on simulated flights; events against the options of the simulator."""
+"""Numbers of the summary are compared with pandas and numpy on simulated flights.
+
+Events are compared with the options of the simulator.
+"""
 
 from itertools import pairwise
 from math import inf
@@ -57,11 +60,15 @@ def flight(bus: BusLayout, rows: list[Row]) -> Flight:
 
 
 def table(bus: BusLayout, rows: list[Row], esc: int, *sources: str) -> pd.DataFrame:
-    """Rows by source, with the time that each holds (0 in front of a gap)."""
-    places = {source: column(bus, source, esc) for source in sources}
-    frame = pd.DataFrame(
-        {source: [values[at] for _, values in rows] for source, at in places.items()}
-    )
+    """Return the rows as a table with a column for each source.
+
+    The column ``held`` is the time for which a row is valid, 0 before a gap.
+    """
+    columns = {}
+    for source in sources:
+        at = column(bus, source, esc)
+        columns[source] = [values[at] for _, values in rows]
+    frame = pd.DataFrame(columns)
     times = np.array([time_ns for time_ns, _ in rows])
     held = np.append(np.diff(times), 0)
     return frame.assign(time_ns=times, held=np.where(held > GAP_NS, 0, held))
@@ -71,9 +78,13 @@ MEASURED = ("battery_voltage", "battery_current", "cell_count")
 
 
 def with_computed(data: pd.DataFrame, source: str) -> pd.DataFrame:
-    """A table with the values that a report of a CAN log computes: those that are sent less often than their parts."""
+    """Return a table with the values that a report of a CAN log computes.
+
+    The report computes the values that are sent less often than their parts.
+    """
     if source == "battery_power":
-        data = data.assign(battery_power=(data.battery_voltage * data.battery_current).round(3))
+        power = (data.battery_voltage * data.battery_current).round(3)
+        data = data.assign(battery_power=power)
     if source == "mean_cell_voltage":
         computed = (data.battery_voltage / data.cell_count).round(3)
         data = data.assign(mean_cell_voltage=computed.fillna(data.mean_cell_voltage))
@@ -85,38 +96,50 @@ def test_the_numbers_equal_those_computed_by_pandas(
     bus: BusLayout, rows: list[Row], flight: Flight, esc: int
 ) -> None:
     sources = (
-        "battery_power battery_voltage battery_current electrical_speed energy_used consumed_charge"
+        "battery_power",
+        "battery_voltage",
+        "battery_current",
+        "electrical_speed",
+        "energy_used",
+        "consumed_charge",
     )
-    data = table(bus, rows, esc, *sources.split())
+    data = table(bus, rows, esc, *sources)
     found = flight.escs[esc]
     live = data[data.battery_voltage.notna()]
+    turning = live[live.electrical_speed.fillna(0) > 0]
     assert found.telemetry_ns == live.held.sum()
-    assert found.turning_ns == live[live.electrical_speed.fillna(0) > 0].held.sum()
+    assert found.turning_ns == turning.held.sum()
     power = (live.battery_voltage * live.battery_current).fillna(0).to_numpy(float)
-    assert found.energy_wh == pytest.approx((power.clip(min=0) * live.held).sum() / 3.6e12)
-    counter = data.energy_used.dropna().to_numpy(float)  # of the gateway, of finer values
+    energy = (power.clip(min=0) * live.held).sum() / 3.6e12
+    assert found.energy_wh == pytest.approx(energy)
+    # the gateway's counter, which is computed from finer values
+    counter = data.energy_used.dropna().to_numpy(float)
     assert found.energy_wh == pytest.approx(counter[-1] - counter[0], abs=0.4)
-    steps = np.diff(data.consumed_charge.dropna().to_numpy(float))
-    charge = np.where(steps < 0, data.consumed_charge.dropna().to_numpy(float)[1:], steps).sum()
+    consumed = data.consumed_charge.dropna().to_numpy(float)
+    steps = np.diff(consumed)
+    charge = np.where(steps < 0, consumed[1:], steps).sum()
     assert found.counted["consumed_charge"] == pytest.approx(charge)
     assert charge > 100
     loaded = live[live.battery_current >= 5]
     assert found.load_voltage is not None
     assert found.load_voltage.value == loaded.battery_voltage.min()
-    before = live[(live.time_ns < loaded.time_ns.iloc[0]) & (live.battery_current.abs() <= 1)]
-    assert found.rest_voltage == before.battery_voltage.iloc[-1]
+    before_load = live.time_ns < loaded.time_ns.iloc[0]
+    resting = live[before_load & (live.battery_current.abs() <= 1)]
+    assert found.rest_voltage == resting.battery_voltage.iloc[-1]
     assert found.cells == 6
     assert {"battery_power", "motor_current", "battery_voltage"} <= found.extremes.keys()
     for source, extreme in found.extremes.items():
         data = with_computed(table(bus, rows, esc, source, *MEASURED), source).dropna()
         values = data[source].to_numpy(float)
-        at = (np.argmin if source in MINIMA else np.argmax)(values)
+        at = values.argmin() if source in MINIMA else values.argmax()
         assert (extreme.value, extreme.time_ns) == (values[at], data.time_ns.iloc[at]), source
 
 
 def test_errors_and_a_swapped_device_are_events_at_their_times(flight: Flight) -> None:
-    def of(text: str, esc: int = 0) -> list[Event]:
-        return [e for e in flight.events if e.kind == "error" and e.text == text and e.esc == esc]
+    errors = [event for event in flight.events if event.kind == "error"]
+
+    def of(text: str) -> list[Event]:
+        return [error for error in errors if error.text == text and error.esc == 0]
 
     for text, severity, *times in (
         ("power stage hot", "warning", 18, 23),
@@ -126,11 +149,11 @@ def test_errors_and_a_swapped_device_are_events_at_their_times(flight: Flight) -
         assert event.severity == severity
         found = [((at or 0) - flight.origin_ns) / S for at in (event.begin_ns, event.end_ns)]
         assert found == pytest.approx(times, abs=0.05)
-    # set for ever: it comes again after each loss and with each info frame
+    # this bit is always set, so the event begins again after each loss and with each info frame
     selftest = of("self-test: EEPROM size")
     assert len(selftest) >= 2
     assert selftest[0].note == "until telemetry was lost"
-    assert not [e for e in flight.events if e.kind == "error" and e.esc == 1]
+    assert not [error for error in errors if error.esc == 1]
     devices = ["Kosmik 120, firmware 4.17", "Kolibri 120, firmware 4.17"]
     assert flight.escs[0].devices == devices
     (change,) = [event for event in flight.events if event.kind == "device"]
@@ -180,17 +203,17 @@ def test_the_peak_power_of_a_log_is_computed_from_voltage_and_current(tmp_path: 
 
 
 def bus_file_with_power_in_each_frame(tmp_path: Path) -> Path:
-    """A DBC that sends voltage, current and power together."""
-    signals = "".join(
-        f' SG_ {name} : {at}|16@1- ({factor},0) [0|0] "{unit}" Gw\n'
-        for at, (name, factor, unit) in zip(
-            (0, 16, 32),
-            (("BatteryVoltage", 0.01, "V"), ("BatteryCurrent", 0.1, "A"), ("BatteryPower", 1, "W")),
-            strict=True,
-        )
-    )
-    (file := tmp_path / "fast.dbc").write_text(
-        f'VERSION ""\nNS_ :\nBS_:\nBU_: Gw\nBO_ 257 Main: 8 Gw\n{signals}'
+    """Write a DBC that sends voltage, current and power together."""
+    file = tmp_path / "fast.dbc"
+    file.write_text(
+        'VERSION ""\n'
+        "NS_ :\n"
+        "BS_:\n"
+        "BU_: Gw\n"
+        "BO_ 257 Main: 8 Gw\n"
+        ' SG_ BatteryVoltage : 0|16@1- (0.01,0) [0|0] "V" Gw\n'
+        ' SG_ BatteryCurrent : 16|16@1- (0.1,0) [0|0] "A" Gw\n'
+        ' SG_ BatteryPower : 32|16@1- (1,0) [0|0] "W" Gw\n'
     )
     return file
 
@@ -212,33 +235,38 @@ def test_many_events_and_states_need_bounded_memory() -> None:
 
 @pytest.mark.parametrize("points", [100, 20_000])
 def test_distant_rows_are_not_joined_even_without_a_row_for_the_loss(points: int) -> None:
-    """As in a log that was stopped for a while: 2 s of rows, nothing for 1.1 s, and so on."""
+    """The log has 2 s of rows, then no rows for 1.1 s, and so on, as if it had been stopped."""
     bus = layout_of(["esc1"])
-    times = [part * 3_100_000_000 + at * 10_000_000 for part in range(40) for at in range(201)]
+    part_ns = 3_100_000_000
+    times: list[int] = []
+    for begin in range(0, 40 * part_ns, part_ns):
+        times += range(begin, begin + 2 * S + 1, S // 100)
     voltages = [20 + number % 7 for number in range(len(times))]
     flight = flight_of(bus, rows_of(bus, times, battery_voltage=voltages), points)
     line = flight.lines[0, "battery_voltage"]
-    drawn = [
-        (t0, t1)
-        for (t0, t1), (a, b) in zip(pairwise(flight.points.times), pairwise(line), strict=True)
-        if a is not None and b is not None
-    ]
+    points_drawn = list(zip(flight.points.times, line, strict=True))
+    drawn = []
+    for (begin, before), (end, after) in pairwise(points_drawn):
+        if before is not None and after is not None:
+            drawn.append((begin, end))
     assert len(drawn) >= 40
-    assert max(t1 - t0 for t0, t1 in drawn) <= 2 * S
-    assert all(t0 // 3_100_000_000 == t1 // 3_100_000_000 for t0, t1 in drawn)
+    assert max(end - begin for begin, end in drawn) <= 2 * S
+    assert all(begin // part_ns == end // part_ns for begin, end in drawn)
     assert flight.escs[0].gaps == 39
 
 
 def test_words_of_errors_and_states_become_events() -> None:
-    """Of an ESC that has a word instead of a flag for each bit, as in captures."""
+    """The ESC has a word of errors instead of a flag for each bit, as in captures."""
     events = Events()
-    fields = [
-        Field(source, "", kind, source=source, esc=0, signal=source)
-        for source, kind in (
-            *(("operating_errors", Kind.WHOLE), ("operating_state", Kind.TEXT)),
-            *(("battery_voltage", Kind.FLOAT), ("bec_voltage", Kind.FLOAT)),
-        )
-    ]
+    kinds = {
+        "operating_errors": Kind.WHOLE,
+        "operating_state": Kind.TEXT,
+        "battery_voltage": Kind.FLOAT,
+        "bec_voltage": Kind.FLOAT,
+    }
+    fields = []
+    for source, kind in kinds.items():
+        fields.append(Field(source, "", kind, source=source, esc=0, signal=source))
     esc = EscFlight(0, layout_of(["esc1"]).escs[0], fields, events)
     programming, unknown = 1 << OperatingError.PROGRAMMING_ALLOWED, 1 << 30
     words = [programming, programming | unknown, 1, 1, None]

@@ -1,4 +1,7 @@
-"""The page in a real browser (headless Chromium): nothing fails, everything is drawn, and it reacts to input."""
+"""The page in a real browser (headless Chromium).
+
+No script fails, everything is drawn, and the page reacts to input.
+"""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -25,7 +28,7 @@ FAULTS = Faults(
         ErrorWindow(OperatingError.UNDERVOLTAGE, 20 * S, S // 2),
     ),
 )
-# Pixels of a plot's data area that are (nearly) of one colour.
+# Count the pixels of a plot's data area that have (nearly) one colour.
 COUNT = """((key, name) => {
   const colour = getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const plot = flight.plots.find((p) => p.key === key), { left, top, width, height } = plot.u.bbox;
@@ -64,7 +67,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(autouse=True)
 def nothing_fails(browser: Browser) -> Iterator[None]:
-    """After each test: no script threw, and nothing but the page was asked for."""
+    """Assert after each test that no script failed and that only the page was loaded."""
     yield
     assert browser.errors == []
     assert len(browser.requests) == 1
@@ -72,7 +75,7 @@ def nothing_fails(browser: Browser) -> Iterator[None]:
 
 
 def centre(browser: Browser, key: str, share: float = 0.5) -> tuple[float, float]:
-    """A point in a plot's data area, on the screen."""
+    """Return a point in a plot's data area, in coordinates of the screen."""
     over = f"flight.plots.find((p) => p.key === '{key}').u.over"
     browser.run(f"{over}.scrollIntoView({{behavior: 'instant', block: 'center'}})")
     browser.settle()
@@ -81,7 +84,7 @@ def centre(browser: Browser, key: str, share: float = 0.5) -> tuple[float, float
 
 
 def count(browser: Browser, key: str, colour: str) -> int:
-    """Pixels of a plot that have a colour of page.css."""
+    """Return the number of pixels of a plot that have a colour of page.css."""
     found: int = browser.run(f"{COUNT}('{key}', '{colour}')")
     return found
 
@@ -97,7 +100,8 @@ def test_every_plot_is_drawn_and_the_page_fits(
     assert [key for key in keys if key.startswith("speed")] == ["speed"]
     assert keys == ["states", *browser.run("flight.data.plots.map((p) => p.key)")]
     for key in keys[1:]:
-        drawn = [count(browser, key, f"--c{style}") for style in range(1 if name == "one" else 2)]
+        colours = ["--c0"] if name == "one" else ["--c0", "--c1"]
+        drawn = [count(browser, key, colour) for colour in colours]
         assert sum(drawn) > 100, (key, drawn)
     bands = [count(browser, "states", f"--s{group}") for group in (0, 3, 4, 5)]
     assert min(bands) > 100, bands
@@ -105,7 +109,7 @@ def test_every_plot_is_drawn_and_the_page_fits(
     assert browser.run("window.hit") is None
 
 
-# Each time label of a plot with its left and right edge, in pixels of the plot's canvas.
+# Return each time label of a plot with its left and right edge, in pixels of the plot's canvas.
 LABELS = """((key) => {
   const { u } = flight.plots.find((p) => p.key === key), axis = u.axes[0];
   u.ctx.font = axis.font[0];
@@ -162,7 +166,10 @@ def test_on_a_phone_the_first_numbers_are_above_the_details(
 
 
 def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Path]) -> None:
-    """Telemetry is lost from 29 to 31 s: what came before and comes after is not the value of the time between."""
+    """Telemetry is lost from 29 to 31 s.
+
+    Values from before and after this time must not be shown for it.
+    """
     browser.open(pages["one"])
     cells = "[...document.querySelectorAll('.u-series:not(:first-child) .u-value')]"
     for seconds, is_known in ((28.5, True), (30.4, False), (30.9, False), (40, True)):

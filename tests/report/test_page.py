@@ -1,4 +1,4 @@
-"""The page as a file: self-contained, escaped, its data those of the lines."""
+"""The page as a file: it is self-contained, all text is escaped, and its data equal the lines."""
 
 import base64
 import hashlib
@@ -78,33 +78,39 @@ def test_all_text_of_the_input_is_escaped(flight: Flight) -> None:
     known = {EVIL: EVIL, "program": EVIL}
     html = render(flight, source=EVIL, provenance=known, wall_ns=1, damage=[EVIL])
     tags = Tags(html)
-    assert [t for t, _ in tags.found].count("script") == 3
-    assert "img" not in [t for t, _ in tags.found]
+    names = [name for name, _ in tags.found]
+    assert names.count("script") == 3
+    assert "img" not in names
     assert "alert(1)" in tags.text
     found = data_of(html)
     assert found["escs"] == [EVIL]
     assert found["events"][0]["text"] == EVIL
-    title = next(i for i, (t, _) in enumerate(tags.found) if t == "title")
-    assert tags.found[title + 1][0] == "style"
+    assert names[names.index("title") + 1] == "style"
 
 
 def test_the_data_of_the_page_equal_the_lines(flight: Flight) -> None:
     found = data_of(render(flight, source="y"))
-    assert found["times"] == [round((t - flight.origin_ns) / S, 6) for t in flight.points.times]
-    written = [
-        (plot["title"], plot["lines"][series["line"]], series["values"])
-        for plot in found["plots"]
-        for series in plot["series"]
-    ]
+    times = [time_ns - flight.origin_ns for time_ns in flight.points.times]
+    assert found["times"] == [round(time_ns / S, 6) for time_ns in times]
+    written = []
+    for plot in found["plots"]:
+        for series in plot["series"]:
+            line = plot["lines"][series["line"]]
+            written.append((plot["title"], line, series["values"]))
     assert len(written) == len(flight.lines)
     assert ("Current", "Motor", flight.lines[0, "motor_current"]) in written
     assert ("Speed", "Output", flight.lines[0, "output_speed"]) in written
 
 
 def test_lines_of_different_magnitudes_have_separate_plots() -> None:
-    speeds = {"output_speed": 850.0, "motor_speed": 8327.0, "electrical_speed": 58344.0}
+    speeds = {
+        "output_speed": 850.0,
+        "motor_speed": 8327.0,
+        "electrical_speed": 58344.0,
+    }
     assert of_like_size(speeds) == [[source] for source in speeds]
-    assert of_like_size({"a": 96.0, "b": 101.0, "c": 0.0, "d": 30.0}) == [["a", "b", "c", "d"]]
+    alike = {"a": 96.0, "b": 101.0, "c": 0.0, "d": 30.0}
+    assert of_like_size(alike) == [["a", "b", "c", "d"]]
 
 
 def test_speeds_share_a_plot_after_the_battery_and_one_line_is_drawn(flight: Flight) -> None:
@@ -115,24 +121,30 @@ def test_speeds_share_a_plot_after_the_battery_and_one_line_is_drawn(flight: Fli
     assert speed["lines"] == ["Output", "Motor", "Electrical"]
     assert [line["drawn"] for line in speed["series"]] == [True, False, False]
     assert speed["note"] == "output drawn, the others differ only by pole pairs and gear"
-    others = [line for plot in plots for line in plot["series"] if plot is not speed]
-    assert all(line["drawn"] for line in others)
+    for plot in plots:
+        if plot is not speed:
+            assert all(line["drawn"] for line in plot["series"])
 
 
 def test_numbers_come_before_details_and_help_before_plots(flight: Flight) -> None:
     html = render(flight, source="y", damage=["3 damaged lines"])
-    places = [
-        html.index(text)
-        for text in ("<h1>", "3 damaged lines", 'class="tiles"', "<dl>", 'id="help"', 'id="plots"')
-    ]
+    order = (
+        "<h1>",
+        "3 damaged lines",
+        'class="tiles"',
+        "<dl>",
+        'id="help"',
+        'id="plots"',
+    )
+    places = [html.index(text) for text in order]
     assert places == sorted(places)
 
 
 def test_a_gap_of_years_is_cut_out_and_noted() -> None:
-    """As on a board without a clock whose time is set while it records."""
+    """A board without a battery for its clock records, and its time is set meanwhile."""
     bus = layout_of(["esc1"])
     jump = 53 * 365 * 86_400 * S
-    times = [at * S // 10 + (jump if at >= 100 else 0) for at in range(200)]
+    times = times_with_a_jump(jump)
     rows = rows_of(bus, times, battery_voltage=[24.0] * 199 + [20.0])
     flight = flight_of(bus, rows)
     assert (flight.end_ns - flight.start_ns) / S == pytest.approx(22, abs=1)
@@ -148,10 +160,17 @@ def test_a_gap_of_years_is_cut_out_and_noted() -> None:
     assert cut == [9.9, flight.cuts[0].length_ns / S]
 
 
+def times_with_a_jump(jump_ns: int) -> list[int]:
+    """Return 20 s of times at intervals of 0.1 s, with a jump in the middle."""
+    even = [at * S // 10 for at in range(200)]
+    return even[:100] + [time_ns + jump_ns for time_ns in even[100:]]
+
+
 def test_a_part_after_a_gap_of_years_starts_at_its_own_time_of_day() -> None:
     bus = layout_of(["esc1"])
-    times = [at * S // 10 + (400 * 86_400 * S if at >= 100 else 0) for at in range(200)]
-    made = Flight(bus.escs, fields_of_log(SignalReader(bus.layout), bus.escs), window=(15.0, None))
+    times = times_with_a_jump(400 * 86_400 * S)
+    fields = fields_of_log(SignalReader(bus.layout), bus.escs)
+    made = Flight(bus.escs, fields, window=(15.0, None))
     for time_ns, values in rows_of(bus, times, battery_voltage=[24.0] * 200):
         made.take(Block([time_ns], [[value] for value in values], None))
     html = render(made.finish(), source="y", wall_ns=0)
@@ -159,7 +178,7 @@ def test_a_part_after_a_gap_of_years_starts_at_its_own_time_of_day() -> None:
 
 
 def test_values_missing_in_the_dbc_are_left_out(tmp_path: Path) -> None:
-    """Without errors in the DBC no number of them is claimed."""
+    """Without errors in the DBC the page does not show a number of errors."""
     file = tmp_path / "lean.dbc"
     signal = ' SG_ BatteryVoltage : 0|16@1+ (0.01,0) [0|655.33] "V" Gw\n'
     file.write_text(f'VERSION ""\nNS_ :\nBS_:\nBU_: Gw\nBO_ 257 Main: 8 Gw\n{signal}')
@@ -171,12 +190,13 @@ def test_values_missing_in_the_dbc_are_left_out(tmp_path: Path) -> None:
 
 
 def test_times_and_numbers_are_written_for_readers() -> None:
-    assert [clock(ns) for ns in (0, 62_540_000_000, 3_661 * S, -1_250 * 10**6)] == [
-        *("0:00.0", "1:02.5", "1:01:01.0", "−0:01.2"),
-    ]
-    assert [duration(ns) for ns in (12_540_000_000, 245 * S, 3_725 * S)] == [
-        *("12.5 s", "4 min 05 s", "1 h 02 min 05 s"),
-    ]
+    assert clock(0) == "0:00.0"
+    assert clock(62_540_000_000) == "1:02.5"
+    assert clock(3_661 * S) == "1:01:01.0"
+    assert clock(-1_250 * 10**6) == "−0:01.2"
+    assert duration(12_540_000_000) == "12.5 s"
+    assert duration(245 * S) == "4 min 05 s"
+    assert duration(3_725 * S) == "1 h 02 min 05 s"
     assert duration(472_221 * 3600 * S) == "19675 days 21 h"
     assert number(-12345.678, 1) == "−12\u202f345.7"
     assert wall_clock(1_763_751_137 * S) == "2025-11-21 18:52:17 UTC"

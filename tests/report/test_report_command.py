@@ -14,7 +14,7 @@ from kontronik_can_gw.times import SECOND as S
 
 @pytest.fixture(scope="module")
 def dump(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The UART bytes of 25 s."""
+    """Return a file with the UART bytes of 25 s."""
     file = tmp_path_factory.mktemp("dump") / "flight 1.bin"
     faults = Faults(errors=(ErrorWindow(OperatingError.UNDERVOLTAGE, 20 * S, S),))
     sent = SimulatedEsc(EscOptions(faults=faults)).frames_until(25 * S)
