@@ -1,8 +1,9 @@
-"""Measures the gateway beside a small C program and beside the obvious Python program, and says which targets are reached.
+"""Compares the gateway with a small C program and with a simple Python program.
 
     .venv/bin/python tests/benchmarks/bench.py [--only NAME ...] [--list] [--seconds N] [--quick]
 
-Standard output has the table, standard error what is going on. Exit code 1 where a benchmark fails; a missed target is no error.
+Prints a table of figures with their targets on standard output, and the progress on standard error.
+The exit code is 1 if a benchmark fails. A missed target is not an error.
 """
 
 import argparse
@@ -31,7 +32,7 @@ BENCHMARKS = {
     "memory": live.memory,
 }
 FOLDER = ROOT / "build" / "bench"
-"""For compiled programs and files of the moment; it stays from run to run."""
+"""Folder of compiled programs and of temporary files. It is kept for the next run."""
 
 
 def seconds(text: str) -> float:
@@ -58,8 +59,10 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"bench: there is no benchmark {one}. See --list.", file=sys.stderr)
             return 2
     FOLDER.mkdir(parents=True, exist_ok=True)
-    lasts, turns = (min(args.seconds, 0.5), 1) if args.quick else (args.seconds, 3)
-    context = Context(FOLDER, lasts, turns, args.quick)
+    if args.quick:
+        context = Context(FOLDER, seconds=min(args.seconds, 0.5), rounds=1, quick=True)
+    else:
+        context = Context(FOLDER, seconds=args.seconds, rounds=3)
     results: dict[str, list[Figure] | str] = {}
     for name, function in BENCHMARKS.items():
         if any(fnmatch.fnmatch(name, one) for one in args.only):
@@ -68,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
                 results[name] = function(context)
             except LeftOut as reason:
                 results[name] = f"left out: {reason}"
-            except Exception as reason:  # one that fails must not end the others
+            except Exception as reason:  # the other benchmarks must still be run
                 results[name] = f"failed: {type(reason).__name__}: {reason}"
                 traceback.print_exc()
     print("\n".join(table(results)))
@@ -76,26 +79,33 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def number(value: float) -> str:
-    """As people read it: 4 figures, no exponent below a thousand million."""
-    whole = abs(value) >= 1000 or value == int(value)
-    return f"{value:,.0f}".replace(",", " ") if whole else f"{value:.4g}"
+    """Return a number with at least 4 digits, and without an exponent below a thousand million."""
+    is_whole = abs(value) >= 1000 or value == int(value)
+    if is_whole:
+        return f"{value:,.0f}".replace(",", " ")
+    return f"{value:.4g}"
 
 
 def table(results: dict[str, list[Figure] | str]) -> list[str]:
-    """Figure, value, target, reached or not."""
-    figures = [each for found in results.values() if not isinstance(found, str) for each in found]
+    """Return lines with the figures, their values and targets, and whether they are reached."""
+    figures: list[Figure] = []
+    for found in results.values():
+        if not isinstance(found, str):
+            figures += found
     width = max((len(each.name) for each in figures), default=0)
     lines = []
     for name, found in results.items():
         lines.append(name)
-        for each in [] if isinstance(found, str) else found:
+        if isinstance(found, str):
+            lines.append(f"  {found}")
+            continue
+        for each in found:
             verdict = {True: "reached", False: "MISSED", None: ""}[each.reached]
             words = f"{each.name:{width}}  {number(each.value):>12}  {each.unit:18}"
             lines.append(f"  {words}  {each.target:9}  {verdict:7}  {each.note}".rstrip())
-        if isinstance(found, str):
-            lines.append(f"  {found}")
     reached = [each.reached for each in figures]
-    return [*lines, "", f"targets: {reached.count(True)} reached, {reached.count(False)} missed"]
+    summary = f"targets: {reached.count(True)} reached, {reached.count(False)} missed"
+    return [*lines, "", summary]
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The gateway at work: CPU time and delay by turns with the two other programs, its start, its memory."""
+"""CPU time and delay of the gateway and of the two other programs, its start and its memory."""
 
 import os
 import re
@@ -35,7 +35,7 @@ _EXTENDED = 0x80000000
 
 
 def compare(context: Context, escs: int) -> dict[str, list[Measured]]:
-    """Rounds of the three programs by turns, so that what disturbs the machine disturbs all."""
+    """Run the three programs by turns, so that other work of the machine disturbs all of them."""
     found: dict[str, list[Measured]] = {program: [] for program in PROGRAMS}
     for _ in range(context.rounds):
         for program, runs in found.items():
@@ -52,34 +52,42 @@ def delay_of(runs: list[Measured], key: str) -> float:
 
 
 def losses(runs: list[Measured]) -> str:
-    """In words, where they are worth a word."""
+    """Return a note on lost frames, or "" if less than 0.1 % are lost."""
     share = median([run.lost_share for run in runs])
     return f"{share:.1%} of its CAN frames lost" if share >= 0.001 else ""
 
 
 def ratio(above: list[Measured], below: list[Measured]) -> float:
-    """Median of the ratios of the rounds."""
-    return median([a.cpu_us / b.cpu_us for a, b in zip(above, below, strict=True)])
+    """Return the median of the ratios of CPU times in all rounds."""
+    rounds = zip(above, below, strict=True)
+    return median([one.cpu_us / other.cpu_us for one, other in rounds])
 
 
 def cpu(context: Context) -> list[Figure]:
-    """CPU time a live frame at 1, 8 and 64 ESCs: C, ours, the obvious program. What is not sent costs nothing: see the losses."""
+    """CPU time for a live frame at 1, 8 and 64 ESCs: C, ours, the obvious program.
+
+    Frames that are lost need no CPU time, so the losses are noted.
+    """
     figures = []
-    aims = {1: ("<= 1.35", ">= 6"), 8: ("<= 1.25", ">= 6"), 64: ("<= 1.2", "")}
-    for escs, (most, least) in list(aims.items())[: 1 if context.quick else None]:
+    targets = {1: ("<= 1.35", ">= 6"), 8: ("<= 1.25", ">= 6"), 64: ("<= 1.2", "")}
+    if context.quick:
+        targets = {1: targets[1]}
+    for escs, (most, least) in targets.items():
         found = compare(context, escs)
         for program, runs in found.items():
             name = f"{program}, {escs} ESC"
             figures.append(Figure(name, cpu_of(runs), "us/frame", note=losses(runs)))
-        ours, note = found["ours"], losses(found["ours"])
-        beside_c, beside_obvious = ratio(ours, found["c"]), ratio(found["obvious"], ours)
-        figures.append(Figure(f"ours / c, {escs} ESC", beside_c, "x", most, note))
-        figures.append(Figure(f"obvious / ours, {escs} ESC", beside_obvious, "x", least, note))
+        ours = found["ours"]
+        note = losses(ours)
+        to_c = ratio(ours, found["c"])
+        to_obvious = ratio(found["obvious"], ours)
+        figures.append(Figure(f"ours / c, {escs} ESC", to_c, "x", most, note))
+        figures.append(Figure(f"obvious / ours, {escs} ESC", to_obvious, "x", least, note))
     return figures
 
 
 def canopen(context: Context) -> list[Figure]:
-    """CPU time with CANopen nodes and default PDOs at 8 ESCs, beside that without, by turns."""
+    """CPU time at 8 ESCs with CANopen nodes and default PDOs, and without them, by turns."""
     plain, both = [], []
     for _ in range(context.rounds):
         plain.append(once(context, "ours", 8))
@@ -95,13 +103,18 @@ def canopen(context: Context) -> list[Figure]:
 
 
 def many(context: Context) -> list[Figure]:
-    """128 ESCs in one process; two buses' worth (15 000 CAN frames a second by 30 ESCs) on one core: none lost.
+    """No frame is lost with 128 ESCs, nor with 30 ESCs on one core.
 
-    A frame that is replaced by the next one, because the process had to wait, counts as lost.
+    30 ESCs send 15 000 CAN frames a second, as many as two buses can carry. A frame also counts as
+    lost if it was replaced by the next one because the process had to wait.
     """
     figures = []
-    pinned = ("taskset", "-c", str(max(os.sched_getaffinity(0))))
-    for escs, prefix in ((4, ()), (2, pinned)) if context.quick else ((128, ()), (30, pinned)):
+    last_core = max(os.sched_getaffinity(0))
+    pinned = ("taskset", "-c", str(last_core))
+    cases: list[tuple[int, tuple[str, ...]]] = [(128, ()), (30, pinned)]
+    if context.quick:
+        cases = [(4, ()), (2, pinned)]
+    for escs, prefix in cases:
         run = once(context, "ours", escs, prefix=prefix)
         what = f"{escs} ESCs" + (" on one core" if prefix else "")
         note = f"delay, 99 %: {run.delay['p99']} us, longest {run.delay['max']:.0f}"
@@ -112,8 +125,9 @@ def many(context: Context) -> list[Figure]:
 
 
 def delay(context: Context) -> list[Figure]:
-    """From the last byte to the fifth CAN frame with one ESC: C, ours, the obvious program."""
-    found, figures = compare(context, 1), []
+    """Delay from the last byte to the fifth CAN frame, one ESC: C, ours, the obvious program."""
+    found = compare(context, 1)
+    figures = []
     for program, runs in found.items():
         note = f"99 %: {delay_of(runs, 'p99'):.0f}, longest {delay_of(runs, 'max'):.0f}"
         figures.append(Figure(f"{program}, median", delay_of(runs, "p50"), "us", note=note))
@@ -125,13 +139,16 @@ def delay(context: Context) -> list[Figure]:
 
 
 def delay_full(context: Context) -> list[Figure]:
-    """The same with 8 ESCs, recorder, status file, CANopen nodes and a master that asks 200 times a second for one of 20 objects."""
+    """The same delay with 8 ESCs, recorder, status file, CANopen nodes and a busy master.
+
+    The master asks 200 times a second for one of 20 objects.
+    """
     runs = [once(context, "ours", 8, "--sdo", config=EVERYTHING) for _ in range(context.rounds)]
     asked = sum(run.result["sdo_sent"] for run in runs)
     answered = sum(run.result["sdo_answers"] for run in runs)
     if not answered:
         raise RuntimeError("the nodes answered no SDO request")
-    lost = max(0, asked - answered - len(runs))  # the last of each run may be on its way
+    lost = max(0, asked - answered - len(runs))  # the end of a run may cut off its last answer
     answer = median([run.result["sdo_us"]["p99"] for run in runs])
     longest = f"longest {delay_of(runs, 'max'):.0f}"
     return [
@@ -147,7 +164,7 @@ def delay_full(context: Context) -> list[Figure]:
 
 
 def first_frame_ms(escs: int, config: str) -> float:
-    """Start the gateway on a bus of its own, wait for its first frame, end it."""
+    """Start the gateway on a new bus, wait for its first frame, and end it. Returns ms."""
     bus = new_bus()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kontronik-bench-")))
@@ -171,10 +188,10 @@ def first_frame_ms(escs: int, config: str) -> float:
 
 
 def start(context: Context) -> list[Figure]:
-    """From exec to the first CAN frame: 1 and 8 ESCs, CANopen, by turns."""
+    """Time from exec to the first CAN frame: 1 and 8 ESCs, CANopen, by turns."""
     cases = {"1 ESC": (1, ""), "8 ESCs": (8, "")}
     cases |= {"1 ESC, CANopen": (1, CANOPEN), "8 ESCs, CANopen": (8, CANOPEN)}
-    first_frame_ms(1, CANOPEN)  # what is compiled at the first run is there from now on
+    first_frame_ms(1, CANOPEN)  # the first run compiles modules
     found: dict[str, list[float]] = {name: [] for name in cases}
     for _ in range(2 * context.rounds - 1):
         for name, (escs, config) in cases.items():
@@ -187,7 +204,10 @@ def start(context: Context) -> list[Figure]:
 
 
 def many_escs_dbc(folder: Path) -> Path:
-    """The shipped DBC with 29-bit ids, so that there is room for 64 ESCs, and sent so seldom that the bus would bear it."""
+    """Write the shipped DBC with 29-bit ids, so that 64 ESCs have enough ids.
+
+    Its messages are sent so seldom that a bus could carry them.
+    """
     text = SHIPPED.read_text()
     ids = "|".join(sorted(set(re.findall(r"^BO_ (\d+)", text, re.MULTILINE))))
     text = re.sub(rf"\b({ids})\b", lambda found: str(int(found[1]) | _EXTENDED), text)
@@ -209,10 +229,10 @@ def memory(context: Context) -> list[Figure]:
     }
     short = replace(context, seconds=min(context.seconds, 3.0))
     dbc = many_escs_dbc(context.folder)
-    rss = {
-        name: once(short, "ours", escs, dbc=dbc, config=config).rss_mb
-        for name, (escs, config) in cases.items()
-    }
+    rss = {}
+    for name, (escs, config) in cases.items():
+        run = once(short, "ours", escs, dbc=dbc, config=config)
+        rss[name] = run.rss_mb
     further = (rss["64 ESCs"] - rss["1 ESC"]) / 63
     nodes = (rss["8 ESCs, CANopen"] - rss["1 ESC, CANopen"]) / 7
     aims = {"1 ESC": "<= 24"}

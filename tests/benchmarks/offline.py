@@ -1,6 +1,7 @@
-"""Conversion of captures and of UART bytes to candump logs and tables: CPU time without the start of the program.
+"""CPU time of converting captures and UART bytes to candump logs and tables.
 
-The bytes are a simulated flight of four minutes, over and over.
+The start of the program is not included. The bytes are a simulated flight of four minutes, which is
+repeated.
 """
 
 import random
@@ -11,13 +12,14 @@ from typing import NamedTuple
 
 from programs import FIVE, Context, Figure, median, say
 
-FLIGHT_S, SEED = 240, 6
+FLIGHT_S = 240
+SEED = 6
 _MB = 1_000_000
 
 
 @cache
 def flight() -> bytes:
-    """About a MB."""
+    """Return the bytes of a flight, about 1 MB."""
     from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 
     say("a flight is simulated")
@@ -26,21 +28,21 @@ def flight() -> bytes:
 
 
 class Run(NamedTuple):
-    """One conversion: CPU time, and in words how much was written."""
+    """The CPU time of a conversion, and a text with the numbers of rows or frames written."""
 
     cpu_s: float
     written: str
 
     @property
     def rows_per_s(self) -> float:
-        """Rows or frames."""
+        """Rows or frames per second of CPU time."""
         return int(self.written.split()[0]) / self.cpu_s
 
 
 def convert(
     context: Context, form: str, source: Path, live: bool = False, dbc: Path | None = None
 ) -> Run:
-    """One conversion. ``live``: of the 16 values of live data."""
+    """Convert a recording. With ``live``, only the 16 values of live data are converted."""
     from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
     from kontronik_can_gw.desk.recordings.fields import Choice
     from kontronik_can_gw.desk.recordings.inputs import open_input
@@ -50,9 +52,11 @@ def convert(
     if form == "parquet":
         import pyarrow.parquet  # type: ignore[import-untyped]
 
-        pyarrow.array([0])  # imports pandas where it is installed
-    target = context.folder / f"converted{'.log' if form == 'candump' else f'.{form}'}"
-    with open_input(source, None if dbc is None else layout_of_dbc(dbc)) as recording:
+        pyarrow.array([0])  # imports pandas if it is installed
+    suffix = "log" if form == "candump" else form
+    target = context.folder / f"converted.{suffix}"
+    layout = None if dbc is None else layout_of_dbc(dbc)
+    with open_input(source, layout) as recording:
         convert_all = partial(to_log, form=form)
         if form in TABLES:
             choice = Choice.of(recording.fields, LiveData._fields if live else ())
@@ -64,54 +68,72 @@ def convert(
 
 
 def capture(context: Context, seconds: int, noise: bool = False) -> Path:
-    """Of one ESC, as a recorder writes it: a read and a turn for each UART frame. ``noise``: 5 % of the frames are spoilt."""
+    """Write a capture of one ESC as a recorder does, with a read and a turn for each UART frame.
+
+    With ``noise``, 5 % of the frames are damaged.
+    """
     from kontronik_can_gw.assembly.assemble import assemble
     from kontronik_can_gw.capture.format import Kind, block, data_payload, json_payload
     from kontronik_can_gw.cli.recording import setup_of
     from kontronik_can_gw.config.parse import parse
 
-    file = context.folder / f"{'noise' if noise else 'capture'}-{seconds}.kcap"
+    name = "noise" if noise else "capture"
+    file = context.folder / f"{name}-{seconds}.kcap"
     if file.exists():
         return file
-    chance, period, start = random.Random(SEED), 10_000_000, 1_000_000_000
+    chance = random.Random(SEED)
+    period = 10_000_000
+    start = 1_000_000_000
     setup = setup_of(assemble(parse({"esc": [{"port": "/dev/ttyUSB0"}]}, "bench.toml")))
     header = setup.header() | {"created_ns": start, "monotonic_ns": start, "wall_ns": start << 30}
     frames = [b"KOD" + frame for frame in flight().split(b"KOD")[1:]]
-    first = [(start, Kind.PORT_OPENED, 0, b"", 0, None), (start, Kind.START, 0, b"", 1, None)]
+    first = [
+        (start, Kind.PORT_OPENED, 0, b"", 0, None),
+        (start, Kind.START, 0, b"", 1, None),
+    ]
     blocks = [(b"H", json_payload(header)), (b"D", data_payload(first))]
     for begin in range(0, 100 * seconds, 50):
         entries: list[tuple[int, int, int, bytes, int, int | None]] = []
         for number in range(begin, begin + 50):
-            now, wire = start + number * period, frames[number % len(frames)]
+            now = start + number * period
+            wire = frames[number % len(frames)]
             if noise and chance.random() < 0.05:
                 at = chance.randrange(len(wire))
-                wire = wire[:at] + bytes([wire[at] ^ 0x55]) + wire[at + 1 :] + chance.randbytes(3)
+                wrong = bytes([wire[at] ^ 0x55])
+                wire = wire[:at] + wrong + wire[at + 1 :] + chance.randbytes(3)
             entries.append((now, Kind.BYTES, 0, wire, 0, now - 4_000_000))
             entries.append((now, Kind.ADVANCE, 0, b"", 0, None))
         blocks.append((b"D", data_payload(entries)))
-    every = enumerate([*blocks, (b"E", b"")])
-    file.write_bytes(b"".join(block(kind, number, payload) for number, (kind, payload) in every))
+    blocks.append((b"E", b""))
+    with file.open("wb") as out:
+        for number, (kind, payload) in enumerate(blocks):
+            out.write(block(kind, number, payload))
     return file
 
 
 def captures(context: Context) -> list[Figure]:
     """An hour's capture of one ESC, and the same with noise."""
-    figures, seconds = [], 60 if context.quick else 3600
-    clean, noisy = capture(context, seconds), capture(context, seconds, noise=True)
+    figures = []
+    seconds = 60 if context.quick else 3600
+    clean = capture(context, seconds)
+    noisy = capture(context, seconds, noise=True)
     for name, form, live, least in (
         ("candump", "candump", False, ""),
         ("parquet, 16 values", "parquet", True, ">= 400000"),
         ("parquet, all values", "parquet", False, ">= 120000"),
     ):
-        rounds = [
-            (convert(context, form, clean, live), convert(context, form, noisy, live))
-            for _ in range(context.rounds)
-        ]
-        spent = median([one.cpu_s for one, _ in rounds]) * 3600 / seconds
-        figures.append(Figure(f"{name}, an hour", spent, "s", "<= 2", rounds[0][0].written))
-        noise = median([noisy.cpu_s / one.cpu_s for one, noisy in rounds])
+        plain = []
+        noise_ratios = []
+        for _ in range(context.rounds):
+            without = convert(context, form, clean, live)
+            with_noise = convert(context, form, noisy, live)
+            plain.append(without)
+            noise_ratios.append(with_noise.cpu_s / without.cpu_s)
+        spent = median([run.cpu_s for run in plain]) * 3600 / seconds
+        figures.append(Figure(f"{name}, an hour", spent, "s", "<= 2", plain[0].written))
+        noise = median(noise_ratios)
         figures.append(Figure(f"{name}, with noise / without", noise, "x", "<= 1.5"))
-        rows = median([one.rows_per_s for one, _ in rounds])
+        rows = median([run.rows_per_s for run in plain])
         figures.append(Figure(f"{name}, rows", rows, "rows/s", least))
     return figures
 
@@ -152,11 +174,16 @@ def report(source: Path) -> float:
 
 
 def plain_bytes(context: Context) -> list[Figure]:
-    """UART bytes at full speed, MB a CPU second: the deframer alone, conversions; the quickest of the rounds."""
+    """MB of UART bytes for a CPU second: the deframer alone, and conversions.
+
+    The fastest of the rounds counts.
+    """
     source = context.folder / "bytes.bin"
-    source.write_bytes(flight() * ((1 if context.quick else 20) * _MB // len(flight()) + 1))
+    wanted = (1 if context.quick else 20) * _MB
+    source.write_bytes(flight() * (wanted // len(flight()) + 1))
     size = source.stat().st_size / _MB
-    figures = [Figure("scan", size / min(scan(source) for _ in range(7)), "MB/s", ">= 900")]
+    fastest = min(scan(source) for _ in range(7))
+    figures = [Figure("scan", size / fastest, "MB/s", ">= 900")]
     for form, live, dbc, aim in (
         ("candump", False, FIVE, ">= 80"),
         ("parquet", True, None, ">= 70"),
@@ -168,15 +195,17 @@ def plain_bytes(context: Context) -> list[Figure]:
 
 
 def scan(source: Path) -> float:
-    """CPU seconds that the core in C needs to find all frames."""
+    """Return the CPU seconds that the core in C needs to find all frames."""
     from kontronik_can_gw.esc.telemetry import EscSettings
     from kontronik_can_gw.native.binding import load
     from kontronik_can_gw.native.core import NativeCore
     from kontronik_can_gw.native.objects import shared_object
     from kontronik_can_gw.signals.plan import Layout
 
-    data, escs = source.read_bytes(), [EscSettings("esc1")]
-    core = NativeCore(load(shared_object()), escs, Layout("", "", ()), 0, False)
+    data = source.read_bytes()
+    escs = [EscSettings("esc1")]
+    empty = Layout("", "", ())
+    core = NativeCore(load(shared_object()), escs, empty, 0, False)
     core.state.mask = 0  # no events
     begun = time.process_time()
     for at in range(0, len(data), 16384):

@@ -1,4 +1,4 @@
-"""What all benchmarks share: figures with their targets, and one measurement of a program while a feeder plays the ESCs."""
+"""Figures with their targets, and measurements of a program while a feeder simulates the ESCs."""
 
 import ctypes
 import json
@@ -23,21 +23,24 @@ FIVE = HERE / "five.dbc"
 PROGRAMS = ("c", "ours", "obvious")
 CANOPEN = '[canopen]\nenabled = true\nself_start = true\nstore = "store"\n'
 EVERYTHING = f'{CANOPEN}[record]\ndirectory = "captures"\n'
-"""Nodes and recorder, beside the status file that every run has."""
+"""Nodes and recorder, in addition to the status file that every run has."""
 STATUS_FOLDER = Path("/dev/shm")
-"""In memory, as a service's /run is: another file system may begin to write out what replaces a file."""
+"""A folder in memory, as /run of a service is. Other file systems may write to the disk at once."""
 _PRIORITY = 80
-"""Of the feeder, where we may: what it measures is not to be its own delay."""
-# what is compiled at the first run is there from then on
+"""Priority of the feeder if we may set it, so that its own delays are not measured."""
+# the first run compiles modules, and the next ones use them
 ENVIRONMENT = os.environ | {"PYTHONHASHSEED": "0", "PYTHONDONTWRITEBYTECODE": ""}
 
 
 class LeftOut(Exception):
-    """This benchmark cannot be run here. The text says what is missing and how to get it, in one line."""
+    """This benchmark cannot be run here.
+
+    The text names the missing program and the command that installs it, in one line.
+    """
 
 
 class Figure(NamedTuple):
-    """A line of the table. ``target``: "<= 2.2" or ">= 4"; a missed one is no error."""
+    """A line of the table. ``target`` is like "<= 2.2" or ">= 4", and may be missed."""
 
     name: str
     value: float
@@ -47,26 +50,34 @@ class Figure(NamedTuple):
 
     @property
     def reached(self) -> bool | None:
-        """None where there is no target."""
+        """True if the value reaches the target. None without a target."""
         if not self.target:
             return None
         sign, limit = self.target.split()
-        return self.value <= float(limit) if sign == "<=" else self.value >= float(limit)
+        if sign == "<=":
+            return self.value <= float(limit)
+        return self.value >= float(limit)
 
 
 @dataclass
 class Context:
-    """How long a benchmark may measure, and where it may write. ``rounds``: of measurements that are compared, by turns."""
+    """The duration of measurements, and the folder for their files."""
 
     folder: Path
     seconds: float = 5.0
+    """Duration of one measurement."""
     rounds: int = 3
+    """Number of measurements of each program, which are made by turns."""
     quick: bool = False
-    """As short as it can be: for trying the benchmarks themselves. Figures mean little."""
+    """Makes all measurements as short as possible, to try the benchmarks. Figures mean little."""
 
     def compiled(self, name: str, *options: str) -> Path:
-        """The program made of a C file in peers/ by gcc -O2; made anew only where the file has changed."""
-        source, gcc = HERE / "peers" / name, shutil.which("gcc")
+        """Return the program that gcc -O2 makes from a C file in peers/.
+
+        It is compiled again only if the file has changed.
+        """
+        source = HERE / "peers" / name
+        gcc = shutil.which("gcc")
         if gcc is None:
             raise LeftOut(f"no gcc to compile {name} with:  sudo apt-get install gcc libc6-dev")
         program = self.folder / source.stem
@@ -77,7 +88,7 @@ class Context:
 
 
 def say(text: str) -> None:
-    """A line of progress, to standard error."""
+    """Print a line of progress to standard error."""
     print(f"  {text}", file=sys.stderr, flush=True)
 
 
@@ -90,7 +101,7 @@ def median(values: Sequence[float]) -> float:
 
 @contextmanager
 def started(command: Sequence[object], **further: Any) -> Iterator["subprocess.Popen[str]"]:
-    """A child that ends with the block, and with us however we end."""
+    """Start a child process that ends with the block, or with this process in any case."""
 
     def die_with_us() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
@@ -108,7 +119,7 @@ def started(command: Sequence[object], **further: Any) -> Iterator["subprocess.P
 
 
 def standin(bus: str, *words: object) -> list[object]:
-    """The command of a Python program on a bus that is no CAN interface."""
+    """Return the command of a Python program on a bus without a CAN interface."""
     return [sys.executable, HERE / "standin.py", bus, *words]
 
 
@@ -117,9 +128,13 @@ def new_bus() -> str:
 
 
 def write_config(folder: Path, ports: Sequence[str], dbc: Path, further: str = "") -> Path:
-    """Our configuration; the 1 Mbit/s are what its bus load is compared with. ``further``: lines, tables at their end."""
+    """Write the gateway's configuration.
+
+    The bus load is compared with its 1 Mbit/s. ``further`` has more lines, with tables at the end.
+    """
     lines = ['[can]\ninterface = "socketcan"\nchannel = "lo"\nbitrate = 1000000']
-    status = (STATUS_FOLDER if STATUS_FOLDER.is_dir() else folder) / f"{folder.name}.json"
+    status_folder = STATUS_FOLDER if STATUS_FOLDER.is_dir() else folder
+    status = status_folder / f"{folder.name}.json"
     lines += [f'[dbc]\nfile = "{dbc}"', further, f'[statistics]\nfile = "{status}"']
     for index, port in enumerate(ports, 1):
         lines.append(f'[[esc]]\nport = "{port}"\nname = "e{index}"\npole_pairs = 7')
@@ -132,22 +147,25 @@ def write_config(folder: Path, ports: Sequence[str], dbc: Path, further: str = "
 
 
 class Measured(NamedTuple):
-    """What one run gave. ``cpu_us``: of all threads of the gateway, for each live frame; ``result``: what the feeder says."""
+    """The results of one run."""
 
     cpu_us: float
+    """CPU time of all threads of the gateway for each live frame."""
     cpu_share: float
+    """Share of a core."""
     rss_mb: float
     result: dict[str, Any]
+    """The results printed by the feeder."""
 
     @property
     def delay(self) -> dict[str, float]:
-        """count, p50, p90, p99, p999, max in microseconds."""
+        """The delays count, p50, p90, p99, p999 and max, in microseconds."""
         found: dict[str, float] = self.result["delay_us"]
         return found
 
     @property
     def frames(self) -> int:
-        """CAN frames that there should have been."""
+        """Number of CAN frames that should have been sent."""
         return 5 * int(self.result["sent"])
 
     @property
@@ -156,16 +174,17 @@ class Measured(NamedTuple):
 
 
 def _cpu_ns(pid: int) -> int:
-    """CPU time of all threads of a process."""
+    """Return the CPU time of all threads of a process."""
     total = 0
     for thread in Path(f"/proc/{pid}/task").iterdir():
-        with suppress(OSError):  # it has just ended
+        with suppress(OSError):  # the thread has just ended
             total += int((thread / "schedstat").read_text().split()[0])
     return total
 
 
 def _rss_mb(pid: int) -> float:
-    found = re.search(r"^VmRSS:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+    status = Path(f"/proc/{pid}/status").read_text()
+    found = re.search(r"^VmRSS:\s+(\d+) kB$", status, re.MULTILINE)
     assert found
     return int(found[1]) / 1024
 
@@ -179,11 +198,18 @@ def once(
     dbc: Path = FIVE,
     prefix: Sequence[str] = (),
 ) -> Measured:
-    """One measurement. ``options``: of the feeder; ``config``: of ours; ``prefix``: in front of the gateway's command."""
-    bus, warmup = new_bus(), 0.5 if context.quick else 2.0
-    words = f"--bus {bus} --escs {escs} --seconds {context.seconds} --warmup {warmup} --priority {_PRIORITY}"
+    """Measure a program once.
+
+    ``options`` are words for the feeder, ``config`` is added to the gateway's configuration, and
+    ``prefix`` is put before the gateway's command.
+    """
+    bus = new_bus()
+    warmup = 0.5 if context.quick else 2.0
+    words = f"--bus {bus} --escs {escs} --seconds {context.seconds}"
+    words += f" --warmup {warmup} --priority {_PRIORITY}"
     limited = ["timeout", context.seconds + warmup + 30, context.compiled("feeder.c", "-pthread")]
-    pipe, nothing = subprocess.PIPE, subprocess.DEVNULL
+    pipe = subprocess.PIPE
+    nothing = subprocess.DEVNULL
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kontronik-bench-")))
         log = stack.enter_context((folder / "errors").open("w"))
@@ -201,7 +227,10 @@ def once(
         gateway = stack.enter_context(started([*prefix, *command], **streams))
 
         def heard(is_last: bool = False) -> dict[str, Any]:
-            """The gateway may end with the bus, before the feeder has said all."""
+            """Read a line of the feeder.
+
+            The gateway ends with the bus, perhaps before the feeder has written its last line.
+            """
             line = feeder.stdout.readline() if feeder.stdout else ""
             if not line or (gateway.poll() is not None and not is_last):
                 said = (folder / "errors").read_text().strip()[-2000:]
@@ -210,16 +239,20 @@ def once(
             return found
 
         begun = heard()["begin"]
-        before, since = _cpu_ns(gateway.pid), time.monotonic_ns()
+        before = _cpu_ns(gateway.pid)
+        since = time.monotonic_ns()
         frames = max(1, heard()["end"] - begun)
-        used, took = _cpu_ns(gateway.pid) - before, time.monotonic_ns() - since
+        used = _cpu_ns(gateway.pid) - before
+        took = time.monotonic_ns() - since
         if not used:
             raise LeftOut("this kernel counts CPU time by ticks, too coarse to compare")
         rss = _rss_mb(gateway.pid)
         measured = Measured(used / 1000 / frames, used / took, rss, heard(True))
     delay = measured.delay
     say(
-        f"{program} {escs:3} ESC: {measured.cpu_us:7.1f} us/frame, {measured.cpu_share:5.1%} of a core, RSS {rss:.1f} MB, "
-        f"lost {measured.lost_share:.2%}, delay {delay['p50']} / {delay['p99']} / {delay['max']:.0f} us"
+        f"{program} {escs:3} ESC: {measured.cpu_us:7.1f} us/frame, "
+        f"{measured.cpu_share:5.1%} of a core, RSS {rss:.1f} MB, "
+        f"lost {measured.lost_share:.2%}, "
+        f"delay {delay['p50']} / {delay['p99']} / {delay['max']:.0f} us"
     )
     return measured

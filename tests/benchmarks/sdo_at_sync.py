@@ -1,9 +1,9 @@
-"""SDO latency of CANopen nodes while SYNCs come, in real time and without a CAN interface.
+"""Measures the SDO latency of CANopen nodes during SYNCs, in real time and without CAN hardware.
 
     python tests/benchmarks/sdo_at_sync.py [NODES] [TYPE] [SECONDS] [HZ]
 
-All TPDOs of all nodes get the transmission type TYPE. On a busy machine run it by `chrt -f 50`, or it
-measures the other programs.
+All TPDOs of all nodes get the transmission type TYPE. On a busy machine run it with `chrt -f 50`,
+because else it measures the other programs.
 """
 
 import os
@@ -30,7 +30,7 @@ _PATIENCE_S = 5.0
 
 
 class Master:
-    """The far end of the bus."""
+    """The other end of the bus, with an SDO client."""
 
     def __init__(self, bus: socket.socket) -> None:
         self._bus = bus
@@ -42,16 +42,17 @@ class Master:
         self._bus.setblocking(False)
 
     def received(self, wait_s: float) -> Iterator[int]:
-        """The ids of the frames that have come, or that come within this time."""
+        """Yield the ids of the waiting frames, or of the frames received within this time."""
         select.select([self._bus], [], [], max(0.0, wait_s))
         try:
             while data := self._bus.recv(128):
-                yield _FRAME.unpack(data[: _FRAME.size])[0]
+                cob_id, _, _ = _FRAME.unpack(data[: _FRAME.size])
+                yield cob_id
         except BlockingIOError:
             return
 
     def ask(self, node: int, request: bytes) -> None:
-        """An SDO request; returns after its answer."""
+        """Send an SDO request and wait for its answer."""
         self.send(0x600 + node, request)
         end = time.monotonic() + _PATIENCE_S
         while time.monotonic() < end:
@@ -73,7 +74,7 @@ def set_up(master: Master, node: int, kind: int) -> None:
 
 
 def measure(master: Master, escs: list[PtyEsc], seconds: float, sync_hz: float) -> list[float]:
-    """The latencies in seconds, sorted."""
+    """Return the sorted latencies in seconds."""
     lives = [encode(LiveData(n, 2442 + n % 7, n % 50), Layout.V4) for n in range(100)]
     start = time.monotonic()
     next_sync = next_live = next_request = start
@@ -104,9 +105,9 @@ def measure(master: Master, escs: list[PtyEsc], seconds: float, sync_hz: float) 
 
 
 def main(arguments: list[str]) -> None:
-    count, kind, seconds, sync_hz = map(
-        float, [*arguments, *("4", "1", "10", "1000")[len(arguments) :]]
-    )
+    defaults = ("4", "1", "10", "1000")
+    given = [*arguments, *defaults[len(arguments) :]]
+    count, kind, seconds, sync_hz = map(float, given)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         escs = [stack.enter_context(PtyEsc()) for _ in range(int(count))]
@@ -117,9 +118,8 @@ def main(arguments: list[str]) -> None:
         listener.settimeout(20)
         file = write_config(folder, [esc.path for esc in escs], _SHIPPED, CANOPEN)
         log = stack.enter_context((folder / "log").open("w"))
-        stack.enter_context(
-            started(standin(bus, "ours", "run", "-c", file), stderr=log, cwd=folder)
-        )
+        command = standin(bus, "ours", "run", "-c", file)
+        stack.enter_context(started(command, stderr=log, cwd=folder))
         far, _ = listener.accept()
         stack.enter_context(far)
         master = Master(far)
@@ -128,10 +128,13 @@ def main(arguments: list[str]) -> None:
             set_up(master, node, int(kind))
         found = measure(master, escs, seconds, sync_hz)
     cores = os.cpu_count()
-    p99 = found[int(0.99 * len(found))]
+    median_ms = found[len(found) // 2] * 1e3
+    p99_ms = found[int(0.99 * len(found))] * 1e3
+    longest_ms = found[-1] * 1e3
     print(
-        f"{len(escs)} nodes, type {int(kind)}, SYNC {sync_hz:g} Hz: {len(found)} requests, median {found[len(found) // 2] * 1e3:.1f} ms, "
-        f"99 % {p99 * 1e3:.1f} ms, longest {found[-1] * 1e3:.1f} ms ({cores} CPUs)"
+        f"{len(escs)} nodes, type {int(kind)}, SYNC {sync_hz:g} Hz: {len(found)} requests, "
+        f"median {median_ms:.1f} ms, 99 % {p99_ms:.1f} ms, longest {longest_ms:.1f} ms "
+        f"({cores} CPUs)"
     )
 
 

@@ -1,10 +1,11 @@
-"""Starts a gateway on a bus that is no CAN interface, for kernels without one: each CAN socket is a local one that leads to the feeder.
+"""Starts a gateway on a bus without a CAN interface, for kernels that have no CAN.
 
-    python standin.py NAME ours run -c FILE      the real gateway's own command line
+    python standin.py NAME ours run -c FILE      the command line of the real gateway
     python standin.py NAME obvious DBC lo PORT...
 
-Only how the socket is made, and its options, are replaced: ``send`` and ``recv`` are the C methods. Frames have the bytes of a raw CAN
-socket, and the local socket keeps them apart.
+Each CAN socket is replaced by a local socket that is connected to the feeder. Only the creation of
+the socket and its options are replaced. ``send`` and ``recv`` are still the C methods. Frames have
+the bytes of a raw CAN socket, and the local socket keeps them separate.
 """
 
 import math
@@ -16,7 +17,7 @@ from typing import Any
 
 
 class BusSocket(socket.socket):
-    """A socket that, where a CAN socket is asked for, is connected to the feeder when it is bound."""
+    """A socket that is connected to the feeder by ``bind`` if a CAN socket is requested."""
 
     name = ""
 
@@ -35,12 +36,12 @@ class BusSocket(socket.socket):
 
     def setsockopt(self, *args: Any) -> None:
         if not self.is_bus:
-            # the options are of CAN; the queue's length is the same for all programs
+            # the options are for CAN only, and all programs have a queue of the same length
             super().setsockopt(*args)
 
 
 def use(bus: str) -> None:
-    """From now on CAN sockets of this process lead to ``bus``."""
+    """Connect all further CAN sockets of this process to ``bus``."""
     BusSocket.name = bus
     socket.socket = BusSocket  # type: ignore[assignment, misc]
 
@@ -53,7 +54,8 @@ def main(arguments: list[str]) -> int:
         str(Path(__file__).resolve().parent / "peers"),
     ]
     if program == "obvious":
-        sys.modules["asammdf"] = None  # type: ignore[assignment]  # where it is installed python-can takes seconds to start
+        # with asammdf, the start of python-can takes seconds
+        sys.modules["asammdf"] = None  # type: ignore[assignment]
         import obvious
 
         obvious.main(rest)
@@ -62,8 +64,9 @@ def main(arguments: list[str]) -> int:
     from kontronik_can_gw.dbc import prepare
     from kontronik_can_gw.runtime.system import locks
 
-    prepare.REFUSE_LOAD = math.inf  # 64 ESCs need several buses' worth
-    locks.PREFIX += f"bench/{os.getpid()}/"  # other benchmarks may run beside this one, each on a bus of its own
+    prepare.REFUSE_LOAD = math.inf  # 64 ESCs need more than one bus can carry
+    # other benchmarks may run at the same time on other buses
+    locks.PREFIX += f"bench/{os.getpid()}/"
     return run(rest)
 
 

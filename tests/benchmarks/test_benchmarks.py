@@ -1,4 +1,4 @@
-"""The benchmarks as a program: a short run gives a table. No time is judged."""
+"""The benchmarks as a program: a short run prints a table. Times are not judged."""
 
 from pathlib import Path
 

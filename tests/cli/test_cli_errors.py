@@ -1,4 +1,7 @@
-"""The command line as a process: bad input gives one clear line with the remedy, the right exit code and nothing else."""
+"""The command line as a process: bad input is answered with one clear line and an exit code.
+
+The line names the remedy, and nothing else is written.
+"""
 
 import contextlib
 import os
@@ -24,7 +27,7 @@ Done = subprocess.CompletedProcess[str]
 
 
 def configuration(tmp_path: Path, port: object = "/dev/ttyUSB0", **more: str) -> Path:
-    """A file with the virtual interface and one ESC; ``more``: table name = lines."""
+    """Write a file with the virtual interface and one ESC. ``more`` has lines by table name."""
     file = tmp_path / "gateway.toml"
     tables = {"can": 'interface = "virtual"'} | more
     text = "".join(f"[{name}]\n{lines}\n" for name, lines in tables.items())
@@ -50,7 +53,7 @@ def test_a_removed_option_is_refused_with_its_replacement(words: str) -> None:
 
 @pytest.mark.parametrize("words", ["describe --form json", "service install --root . --chan can1"])
 def test_an_abbreviated_option_is_refused(words: str) -> None:
-    """A script that abbreviates would mean another option after an update."""
+    """In a script an abbreviation could mean another option after an update."""
     assert f"unrecognized arguments: {words.split()[-2]}" in refused(2, *words.split())
 
 
@@ -68,9 +71,10 @@ def test_removed_options_are_not_in_use_again() -> None:
 
 
 def forbidden(path: str, mode: int) -> list[str]:
-    """Take the right to open a terminal from the program that is started with the words returned.
+    """Remove the right to open a terminal from a program started with the returned words.
 
-    A user is kept out by the owner's bits of his own terminal; root by another owner, without root's power to override that.
+    A user lacks the right because the bits of the owner are removed from the terminal. Root does
+    because the terminal gets another owner, and the words remove the power of root to ignore it.
     """
     if os.geteuid():
         os.chmod(path, mode & 0o077)
@@ -220,7 +224,7 @@ def test_the_lines_that_replace_removed_options_are_accepted() -> None:
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some adapters are written to at opening; to an ESC nothing may be written."""
+    """Opening some adapters writes to them, and nothing may be written to an ESC."""
     monkeypatch.chdir(tmp_path)
     port = tmp_path / "ttyESC"
     port.touch()

@@ -1,4 +1,4 @@
-"""``simulate``: terminals, links, files, signals; what is transmitted to the ESC."""
+"""``simulate``: terminals, links, files and signals, and bytes transmitted to the ESC."""
 
 import os
 import signal
@@ -25,35 +25,41 @@ def frames_of(data: bytes) -> list[Frame]:
 
 
 def written(tmp_path: Path, words: str) -> list[Frame]:
-    assert run("simulate", "--out", tmp_path / "out.bin", *words.split()).code == 0
-    return frames_of((tmp_path / "out.bin").read_bytes())
+    file = tmp_path / "out.bin"
+    assert run("simulate", "--out", file, *words.split()).code == 0
+    return frames_of(file.read_bytes())
 
 
-def test_a_file_and_standard_output_get_the_simulators_bytes(
-    tmp_path: Path,
-) -> None:
+def test_a_file_and_standard_output_get_the_simulators_bytes(tmp_path: Path) -> None:
     words = ["simulate", "--seconds", "90", "--seed", "5", "--out"]
-    assert run(*words, tmp_path / "out.bin").code == 0
-    expected = SimulatedEsc(seed=5).frames_until(90 * 10**9 - 1)
-    assert (tmp_path / "out.bin").read_bytes() == b"".join(sent.wire for sent in expected)
-    assert run(*words, "-").data == (tmp_path / "out.bin").read_bytes()
+    file = tmp_path / "out.bin"
+    assert run(*words, file).code == 0
+    sent = SimulatedEsc(seed=5).frames_until(90 * 10**9 - 1)
+    expected = b"".join(frame.wire for frame in sent)
+    assert file.read_bytes() == expected
+    assert run(*words, "-").data == expected
     assert run(*words, tmp_path / "esc{n}.bin", "--esc", 3, "--layout", "legacy").code == 0
     files = [(tmp_path / f"esc{n}.bin").read_bytes() for n in (1, 2, 3)]
     assert len(set(files)) == 3
-    assert {frame.layout for file in files for frame in frames_of(file)} == {Layout.LEGACY}
+    for data in files:
+        assert {frame.layout for frame in frames_of(data)} == {Layout.LEGACY}
 
 
 def test_error_bits_and_the_device_are_as_requested(tmp_path: Path) -> None:
     words = "--error undervoltage@1s+500ms --error BEC-overcurrent@2 --device kontrol-x"
     frames = written(tmp_path, f"{words} --seconds 6")
-    errors = [f.data.operating_errors for f in frames if isinstance(f.data, LiveData)]
-    assert [word & 1 for word in errors] == [int(100 <= n < 150) for n in range(600)]
-    bec = 1 << OperatingError.BEC_OVERCURRENT
-    assert [word & bec for word in errors] == [bec if n >= 200 else 0 for n in range(600)]
+    lives = [frame.data for frame in frames if isinstance(frame.data, LiveData)]
+    errors = [live.operating_errors for live in lives]
+    undervoltage = [word & 1 for word in errors]
+    assert undervoltage == [0] * 100 + [1] * 50 + [0] * 450
+    overcurrent = [word >> OperatingError.BEC_OVERCURRENT & 1 for word in errors]
+    assert overcurrent == [0] * 200 + [1] * 400
     infos = [frame.data for frame in frames if isinstance(frame.data, InfoData)]
-    assert [KONTRONIK.value("device_raw", info) for info in infos] == [Device.KONTROL_X] * 6
+    devices = [KONTRONIK.value("device_raw", info) for info in infos]
+    assert devices == [Device.KONTROL_X] * 6
     assert KONTRONIK.value("variant", infos[0]) == 120
-    assert (KONTRONIK.firmware_text(infos[0]), infos[0].cell_count) == ("4.17", 6)
+    assert KONTRONIK.firmware_text(infos[0]) == "4.17"
+    assert infos[0].cell_count == 6
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -94,10 +100,8 @@ def test_a_gateway_that_transmits_to_the_esc_is_reported() -> None:
         loud = f"ERROR: esc1 {path}: the gateway transmits to the ESC: 41 54\n"
         assert process.stderr.readline() == loud
         process.send_signal(signal.SIGTERM)
-        assert (
-            "the gateway transmits to the ESC: 41 54. Nothing may ever be sent"
-            in process.stderr.read()
-        )
+        said = process.stderr.read()
+        assert "the gateway transmits to the ESC: 41 54. Nothing may ever be sent" in said
         os.close(fd)
     assert process.returncode == 1
 
@@ -112,4 +116,5 @@ def test_a_regular_file_in_place_of_the_link_is_not_replaced(tmp_path: Path) -> 
 
 
 def test_lost_and_disturbed_frames_are_missing_and_the_rest_is_decoded(tmp_path: Path) -> None:
-    assert 150 < len(written(tmp_path, "--seconds 3 --flip-bits 3e-4 --dropout 500ms/2s")) < 253
+    frames = written(tmp_path, "--seconds 3 --flip-bits 3e-4 --dropout 500ms/2s")
+    assert 150 < len(frames) < 253

@@ -1,4 +1,7 @@
-"""A command whose reader has ended (`| head -1`) ends quietly, with the exit code that a shell shows for SIGPIPE."""
+"""A command whose reader has ended (`| head -1`) ends silently.
+
+Its exit code is the one that a shell shows for SIGPIPE.
+"""
 
 import os
 import subprocess
@@ -11,7 +14,10 @@ PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 CLOSED = 141
 NOTES = (
     b"kontronik-can-gw: by gateway.toml",
-    b"kontronik-can-gw: the ESC and its faults are simulated; the gateway and the monitor are the real ones",
+    (
+        b"kontronik-can-gw: the ESC and its faults are simulated; "
+        b"the gateway and the monitor are the real ones"
+    ),
 )
 """Lines that commands write to standard error before their data."""
 COMMANDS = (
@@ -56,7 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def closed(
     words: str, folder: Path, *, has_closed_stderr: bool
 ) -> "subprocess.CompletedProcess[bytes]":
-    """The command with a closed pipe as standard output, and buffered as usual."""
+    """Run a command with a closed pipe as its standard output, which is buffered as usual."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
     reader, writer = os.pipe()
     os.close(reader)

@@ -1,4 +1,4 @@
-"""The completion scripts, made of the command line's parser, as the shells read them."""
+"""The completion scripts, which are generated from the parser of the command line."""
 
 import shutil
 import subprocess
@@ -12,7 +12,7 @@ from kontronik_can_gw.cli import COMMANDS
 
 @pytest.fixture(scope="module")
 def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The script for bash, in a folder with some files."""
+    """Write the script for bash into a folder with some files."""
     done = run("completion", "bash")
     assert (done.code, done.err) == (0, "")
     folder = tmp_path_factory.mktemp("completion")
@@ -25,7 +25,8 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
 ASKED = r"""
     source "$0"
     function=$(complete -p kontronik-can-gw | sed 's/.*-F \([^ ]*\).*/\1/')
-    COMP_WORDS=(kontronik-can-gw $1); COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); COMP_LINE="kontronik-can-gw $1"; COMP_POINT=${#COMP_LINE}
+    COMP_WORDS=(kontronik-can-gw $1); COMP_CWORD=$((${#COMP_WORDS[@]} - 1))
+    COMP_LINE="kontronik-can-gw $1"; COMP_POINT=${#COMP_LINE}
     "$function" kontronik-can-gw "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"
     printf '%s\n' "${COMPREPLY[@]}"
 """

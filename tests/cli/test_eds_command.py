@@ -1,4 +1,4 @@
-"""``eds``: the EDS byte for byte, and DCFs that read back with the values of the node."""
+"""``eds``: the EDS is equal byte for byte, and DCFs have the values of the node."""
 
 import io
 import re
@@ -20,17 +20,24 @@ Key = tuple[int, int]
 
 
 def command(*words: object) -> tuple[object, str, str]:
-    """Exit code, standard output with its line ends, talk."""
+    """Run ``eds``. Returns the exit code, the output with its line ends, and the messages."""
     done = run("eds", *words)
     return done.code, done.data.decode("ascii"), done.err
 
 
 def configuration(folder: Path, *more: str) -> Path:
-    """A file with an EDS of the user's."""
-    head = ("[dbc]", "enabled = false", "[canopen]", "enabled = true", 'eds = "mine.eds"')
-    return written(
-        folder / "gateway.toml", "\n".join([*head, *more, "[[esc]]", 'port = "/dev/ttyUSB0"'])
-    )
+    """Write a configuration with an EDS of the user."""
+    lines = [
+        "[dbc]",
+        "enabled = false",
+        "[canopen]",
+        "enabled = true",
+        'eds = "mine.eds"',
+        *more,
+        "[[esc]]",
+        'port = "/dev/ttyUSB0"',
+    ]
+    return written(folder / "gateway.toml", "\n".join(lines))
 
 
 def imported(text: str) -> Any:
@@ -40,14 +47,16 @@ def imported(text: str) -> Any:
 
 
 def values(dictionary: Any) -> dict[Key, int | bytes]:
-    """Every ParameterValue, as the canopen library reads it."""
+    """Return every ParameterValue, as the canopen library reads it."""
     found: dict[Key, int | bytes] = {}
     for item in dictionary.values():
         is_alone = isinstance(item, canopen.objectdictionary.ODVariable)
         for each in [item] if is_alone else item.values():
-            if (value := each.value) is not None:
-                key = each.index, each.subindex
-                found[key] = value.encode() if isinstance(value, str) else value
+            value = each.value
+            if isinstance(value, str):
+                value = value.encode()
+            if value is not None:
+                found[each.index, each.subindex] = value
     return found
 
 
@@ -68,10 +77,10 @@ def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
 def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
     tmp_path: Path, output: str, named: str
 ) -> None:
-    lines = EDS.read_bytes().replace(
-        b"FileName=kontronik_esc.eds\r\n", b"filename = old.eds\r\nLastEDS=older.eds\r\n"
-    )
-    (tmp_path / "mine.eds").write_bytes(lines)
+    shipped_name = b"FileName=kontronik_esc.eds\r\n"
+    other_names = b"filename = old.eds\r\nLastEDS=older.eds\r\n"
+    mine = EDS.read_bytes().replace(shipped_name, other_names)
+    (tmp_path / "mine.eds").write_bytes(mine)
     file = configuration(tmp_path)
     assert command("-c", file, "--node-id", 1, "-o", tmp_path / output)[0] == 0
     head = (tmp_path / output).read_text("ascii").partition("[DeviceInfo]")[0]
@@ -82,17 +91,18 @@ def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
 
 
 def test_the_node_answers_with_the_values_of_the_dcf() -> None:
-    """Byte for byte: encoded by the canopen library, and as an SDO upload gives it."""
+    """The values encoded by the canopen library are equal to the data of SDO uploads."""
     node = shipped_canopen([5]).nodes([EscSettings()]).nodes[0]
     made = command("--node-id", 5)[1]
     dictionary = imported(made)
-    assert "LSS_SerialNumber" not in made  # there is none to look for
+    assert "LSS_SerialNumber" not in made  # the node has no serial number
     assert (dictionary.node_id, dictionary.bitrate) == (5, 500_000)
     found = values(dictionary)
     assert len(found) > 100
     # a tool that writes all values must not store, restore or clear anything
     states = (0x1001, 0x1002, 0x1003, 0x1010, 0x1011, 0x1020, 0x1021, 0x2010, 0x2102, 0x603F)
-    assert not {index for index, _ in found} & set(states) and not set(found) & set(BINDINGS)
+    assert not {index for index, _ in found} & set(states)
+    assert not set(found) & set(BINDINGS)
     for (index, sub), value in found.items():
         text = value.decode() if isinstance(value, bytes) else value
         data = dictionary.get_variable(index, sub).encode_raw(text)

@@ -83,9 +83,12 @@ def folder(tmp_path: Path, recording: bytes, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.fixture
 def no_rights(folder: Path) -> Iterator[None]:
-    """Nothing in the folder can be opened or made, also not by root, who lays his rights down."""
+    """Run a command while nothing in the folder can be opened or created.
+
+    Root gives up its rights during this time.
+    """
     for words in ("describe", "convert x.bin - --to csv", "replay x.bin --on pty --delay 0"):
-        run(*words.split())  # what they import may be out of reach then
+        run(*words.split())  # imports modules while they can be read
     user = os.geteuid()
     for path in folder.iterdir():
         path.chmod(0)
@@ -134,9 +137,9 @@ def test_an_input_without_read_permission_has_exit_code_2(
     if command.startswith("doctor"):
         run("doctor", "-c", f"closed.{kind}")
     if command.startswith(("mqtt", "metrics")):
-        run(*command.format(f=f"none.{kind}").split())  # their libraries are out of reach later
+        run(*command.format(f=f"none.{kind}").split())  # imports libraries while they can be read
     if command.startswith("run"):
-        from kontronik_can_gw.runtime import loop  # noqa: F401  out of reach later
+        from kontronik_can_gw.runtime import loop  # noqa: F401  cannot be read later
     request.getfixturevalue("no_rights")
     refused(2, command.format(f=f"closed.{kind}"), f"closed.{kind}")
 

@@ -1,4 +1,4 @@
-"""The text of --help, what a mistyped command line is told, and that all descriptions name what the program does."""
+"""The text of --help, messages about mistyped command lines, and descriptions of the program."""
 
 import argparse
 import re
@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """A parser and those of all its commands and actions."""
+    """Yield a parser and the parsers of all its commands and actions."""
     yield parser
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -39,18 +39,22 @@ def test_help_fits_80_columns_and_has_a_description(parser: argparse.ArgumentPar
 
 
 def test_every_command_is_tested() -> None:
-    assert {f"kontronik-can-gw {name}" for name in COMMANDS} <= {each.prog for each in EVERY}
-    assert "kontronik-can-gw service install" in {each.prog for each in EVERY}
+    programs = {each.prog for each in EVERY}
+    assert {f"kontronik-can-gw {name}" for name in COMMANDS} <= programs
+    assert "kontronik-can-gw service install" in programs
 
 
 def test_dronecan_is_named_in_every_description_of_the_program() -> None:
+    control = (ROOT / "deb" / "control").read_text()
+    make_deb = (ROOT / "deb" / "make_deb.py").read_text()
+    project = (ROOT / "pyproject.toml").read_text()
     texts = {
         "help": make_parser().description or "",
         "run": COMMANDS["run"],
-        "package": (ROOT / "deb" / "control").read_text().partition("Description:")[2],
-        "manual page": (ROOT / "deb" / "make_deb.py").read_text().partition('"--description", ')[2][:99],
-        "project": re.findall("(?m)^description = .*", (ROOT / "pyproject.toml").read_text())[0],
-    }  # fmt: skip
+        "package": control.partition("Description:")[2],
+        "manual page": make_deb.partition('"--description", ')[2][:99],
+        "project": re.findall("(?m)^description = .*", project)[0],
+    }
     assert [name for name, text in texts.items() if "DroneCAN" not in text] == []
 
 
@@ -87,12 +91,16 @@ def test_a_mistyped_command_line_shows_usage_and_suggestion(
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_an_unknown_option_shows_the_usage_of_the_command(name: str) -> None:
-    given = {"service": ["install"], "completion": ["bash"], "export": ["c"]}
-    required = {"report": ["x", "-o", "-"], "replay": ["x", "--on", "can"]}
-    needed = given.get(name, []) + required.get(
-        name, ["x"] if name in ("convert", "decode") else []
-    )
-    done = run(name, *needed, "--no-such-option")
+    required = {
+        "service": ["install"],
+        "completion": ["bash"],
+        "export": ["c"],
+        "report": ["x", "-o", "-"],
+        "replay": ["x", "--on", "can"],
+        "convert": ["x"],
+        "decode": ["x"],
+    }
+    done = run(name, *required.get(name, []), "--no-such-option")
     place = f"{name} install" if name == "service" else name
     assert (done.code, done.out) == (2, "")
     assert done.err.startswith(f"usage: kontronik-can-gw {place} [-h]")

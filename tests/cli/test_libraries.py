@@ -1,4 +1,7 @@
-"""How to install a library that only some commands need: the advice works for each kind of installation."""
+"""Advice on how to install a library that only some commands need.
+
+The advice works for each kind of installation.
+"""
 
 import re
 import sys
@@ -16,9 +19,9 @@ PROJECT = Path(__file__).resolve().parents[2]
 def test_each_extra_has_the_library_of_pyproject() -> None:
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    assert {extra: [library] for extra, library in EXTRAS.items()} == {
-        extra: extras[extra] for extra in extras if extra not in ("all", "test")
-    }
+    del extras["all"]
+    del extras["test"]
+    assert {extra: [library] for extra, library in EXTRAS.items()} == extras
 
 
 @pytest.mark.parametrize(
@@ -57,7 +60,7 @@ def test_in_the_debian_package_the_advice_is_to_install_a_clone(
 
 
 def test_no_text_names_an_index_that_lacks_the_package() -> None:
-    """The package is on no index: an extra of it can only be installed from a clone."""
+    """The package is not on an index, so its extras can only be installed from a clone."""
     places = [PROJECT / "README.md", *(PROJECT / "kontronik_can_gw").rglob("*.py")]
     for folder in ("docs", "examples"):
         places += [path for path in (PROJECT / folder).rglob("*") if path.is_file()]

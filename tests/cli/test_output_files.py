@@ -1,4 +1,4 @@
-"""One rule for every command with an output: what exists is replaced only with --force, an input never."""
+"""Every command replaces an existing output only with --force, and never replaces an input."""
 
 import os
 import signal
@@ -32,7 +32,7 @@ COMMANDS = (
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working folder, with a configuration, its DBC and a recording."""
+    """Return the working folder, with a configuration, its DBC and a recording."""
     monkeypatch.chdir(tmp_path)
     assert run("dbc", "-o", "own.dbc").code == 0
     assert run("simulate", "--seconds", 2, "-o", "x.bin").code == 0

@@ -1,4 +1,7 @@
-"""What files, logs and buses say reaches no terminal and no log as a command: escape sequences, controls, turned directions."""
+"""Text from files, logs and buses does not control a terminal or a log.
+
+Escape sequences, control characters and characters that change the direction are replaced.
+"""
 
 import io
 import json
@@ -37,7 +40,7 @@ def test_control_characters_are_shown_as_question_marks() -> None:
     assert json.loads(text) == {EVIL: [EVIL, "µ", "\U000e0001"]}
 
 
-# --- the places where text goes out
+# --- the functions that write text
 
 
 def test_printed_lines_and_errors_are_cleaned(capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,7 +68,7 @@ def test_a_log_message_stays_one_line() -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A configuration whose DBC and EDS are full of it."""
+    """Write a configuration whose DBC and EDS have such characters in all texts."""
     evil = "a\x1bEVIL\x07\x9b\u202eb"
     dbc = re.sub(
         r'(CM_ (?:SG_|BO_)?[^"]*"|NotAvailable" 0x|VAL_ 1664 OperatingState 1 ")', rf"\1{evil}", DBC
@@ -91,7 +94,7 @@ def test_descriptions_of_hostile_files_are_cleaned(words: list[str], folder: Pat
 def test_a_file_shown_on_a_terminal_is_cleaned(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for is_terminal in (False, True):  # into a pipe it goes as it is
+    for is_terminal in (False, True):  # text in a pipe is not changed
         out = io.TextIOWrapper(io.BytesIO(), "utf-8")
         monkeypatch.setattr(out, "isatty", lambda is_terminal=is_terminal: is_terminal)
         with redirect_stdout(out):

@@ -1,4 +1,7 @@
-"""What can go wrong before a command has begun: Ctrl-C while modules are loaded, too few open files. Never a traceback."""
+"""Problems before a command begins: Ctrl-C while modules are loaded, and too few open files.
+
+They never cause a traceback.
+"""
 
 import os
 import signal
@@ -62,7 +65,7 @@ def test_ctrl_c_while_modules_are_loaded_ends_silently(
 
 
 def test_an_ignored_ctrl_c_does_not_end_the_program(folder: Path) -> None:
-    """As of a shell script's background jobs."""
+    """Ctrl-C is ignored as in background jobs of a shell script."""
     code = "import signal; signal.signal(2, signal.SIG_IGN)\n" + INTERRUPTED
     code = code.format(module="kontronik_can_gw.cli", words=["schema"], start=AS_MODULE, loaded=[])
     done = run(sys.executable, "-c", code, folder=folder)

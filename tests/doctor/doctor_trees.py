@@ -1,4 +1,7 @@
-"""A machine made of files in a folder: /sys, /proc, /dev and what programs print, for the checks of `doctor`."""
+"""A machine made of files in a folder, for the checks of `doctor`.
+
+It has /sys, /proc, /dev and the output of programs.
+"""
 
 import os
 import stat
@@ -13,7 +16,7 @@ ROOM = (False, 1 << 30)
 
 
 class Tree(Machine):
-    """A machine below a folder. Only what a test adds exists."""
+    """A machine below a folder. It contains only the things that a test adds."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
@@ -22,14 +25,17 @@ class Tree(Machine):
         self.devices: dict[str, os.stat_result] = {}
         self.full: dict[str, tuple[bool, int]] = {}
         self.closed: set[str] = set()
-        """Files and folders that we may not open or fill."""
-        root.chmod(0o755)  # pytest's own is closed
+        """Files and folders that this user may not open or write to."""
+        root.chmod(0o755)  # only the owner may enter the folder that pytest creates
         self.folder("/dev")
 
-    # --- making it
+    # --- building the tree
 
     def folder(self, name: str, mode: int = 0o755) -> None:
-        """A folder with this mode, whatever the umask; those above it too, which everybody may enter."""
+        """Create a folder with this mode, for any umask.
+
+        Missing folders above it are created too, and every user may enter them.
+        """
         path = self.path(name)
         if not path.parent.exists():
             self.folder(os.path.dirname(name))
@@ -43,7 +49,7 @@ class Tree(Machine):
         self.path(name).chmod(0o644)
 
     def link(self, name: str, target: str) -> None:
-        """A symbolic link to an absolute name of this machine."""
+        """Create a symbolic link to an absolute name of this machine."""
         if not self.path(name).parent.exists():
             self.folder(os.path.dirname(name))
         self.path(name).symlink_to(self.path(target))
@@ -51,7 +57,7 @@ class Tree(Machine):
     def device(
         self, name: str, number: tuple[int, int], mode: int = 0o660, group: int = DIALOUT
     ) -> None:
-        """A character device of root's."""
+        """Create a character device whose owner is root."""
         self.file(name, "")
         values = (stat.S_IFCHR | mode, 0, 0, 1, 0, group, 0, 0, 0, 0)
         self.devices[name] = os.stat_result(values, {"st_rdev": os.makedev(*number)})
@@ -64,7 +70,7 @@ class Tree(Machine):
             self.link(f"/proc/{pid}/fd/{number}", name)
 
     def ftdi(self, serial: str = "A1234") -> None:
-        """An FTDI adapter with its device node and udev's names."""
+        """Add an FTDI adapter with its device node and the names made by udev."""
         usb = "/sys/devices/pci0/usb1/1-1"
         port = f"{usb}/1-1:1.0/ttyUSB0"
         self.file(f"{usb}/idVendor", "0403\n")
@@ -79,7 +85,10 @@ class Tree(Machine):
         self.link("/dev/serial/by-path/pci-usb-0:1", "/dev/ttyUSB0")
 
     def uart(self, tty: str, compatible: str = "") -> None:
-        """A UART on the board, as kernels since 6.6 show it: two devices of the serial core between it and the tty."""
+        """Add a UART of the board as shown by kernels since 6.6.
+
+        Two devices of the serial core are between the UART and the tty.
+        """
         board = f"/sys/devices/platform/soc/{tty}.serial"
         core = f"{board}/{tty}:0/{tty}:0.0"
         self.folder(f"{core}/tty/{tty}")
@@ -90,14 +99,22 @@ class Tree(Machine):
         self.device(f"/dev/{tty}", (4, 64))
 
     def systemd(self, **shown: str) -> None:
-        """systemd with our unit, which shows these properties besides the usual ones."""
-        usual = {"LoadState": "loaded", "ActiveState": "active", "SubState": "running"}
-        usual |= {"UnitFileState": "enabled", "NRestarts": "0", "Result": "success", "User": "anna"}
-        text = "".join(f"{name}={value}\n" for name, value in {**usual, **shown}.items())
+        """Add systemd with our unit, which shows these properties in addition to the usual ones."""
+        usual = {
+            "LoadState": "loaded",
+            "ActiveState": "active",
+            "SubState": "running",
+            "UnitFileState": "enabled",
+            "NRestarts": "0",
+            "Result": "success",
+            "User": "anna",
+        }
+        properties = {**usual, **shown}
+        text = "".join(f"{name}={value}\n" for name, value in properties.items())
         self.programs["systemctl", "show"] = text
         self.folder("/run/systemd/system")
 
-    # --- what the checks see
+    # --- the interface that the checks use
 
     def group_name(self, gid: int) -> str:
         return {0: "root", DIALOUT: "dialout"}.get(gid, str(gid))
@@ -106,10 +123,11 @@ class Tree(Machine):
         return self.devices.get(self.real(name)) or super().status(name)
 
     def run(self, *command: str) -> str:
-        """What was put down for the longest beginning of this command."""
+        """Return the output stored for the longest beginning of this command, or ""."""
         for length in range(len(command), 0, -1):
-            if (found := self.programs.get(command[:length])) is not None:
-                return found
+            beginning = command[:length]
+            if beginning in self.programs:
+                return self.programs[beginning]
         return ""
 
     def space(self, folder: str) -> tuple[bool, int]:
@@ -120,12 +138,13 @@ class Tree(Machine):
 
 
 def only(findings: Sequence[Finding], check: str) -> Finding:
-    """The one finding of a check."""
+    """Return the single finding of a check."""
     found = [finding for finding in findings if finding.check == check]
     assert len(found) == 1, f"{check}: {found}"
     return found[0]
 
 
 def grave(findings: Sequence[Finding]) -> dict[str, str]:
-    """What is not as it should be, by check."""
-    return {finding.check: finding.severity for finding in findings if finding.severity != "ok"}
+    """Return the severities of all findings that are not ok, by check."""
+    found = [finding for finding in findings if finding.severity != "ok"]
+    return {finding.check: finding.severity for finding in found}

@@ -1,4 +1,7 @@
-"""What `doctor` says of a CAN interface. The documents are those of `ip -json -details -statistics link show`."""
+"""Findings of `doctor` at a CAN interface.
+
+The documents are as printed by `ip -json -details -statistics link show`.
+"""
 
 import json
 from copy import deepcopy
@@ -12,7 +15,8 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.doctor.can import check_can
 
 OK, NOTE, WARNING, ERROR = "ok", "note", "warning", "error"
-PLAIN, FD = CanConfig(), CanConfig(fd=True)
+PLAIN = CanConfig()
+FD = CanConfig(fd=True)
 UP = "sudo ip link set can0 up type can bitrate 500000"
 
 
@@ -29,18 +33,18 @@ SYS = {"type": "280", "flags": "0x40041", "mtu": "16"}
 
 
 def controller() -> dict[str, Any]:
-    """An adapter with everything as it should be: ``linkinfo`` of `ip`, and files of /sys."""
+    """Return an adapter with correct settings: ``linkinfo`` of `ip`, and files of /sys."""
     info = {"info_kind": "can", "info_data": LINK}
     return deepcopy({"linkinfo": info, **SYS})
 
 
 def info(**data: object) -> dict[str, Any]:
-    """A change below linkinfo/info_data."""
+    """Return a change below linkinfo/info_data."""
     return {"linkinfo": {"info_data": data}}
 
 
 def merged(found: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    """``None`` removes a key."""
+    """Change a nested dictionary. ``None`` removes a key."""
     for key, value in change.items():
         if isinstance(value, dict) and isinstance(found.get(key), dict):
             merged(found[key], value)
@@ -57,7 +61,7 @@ def tree(tmp_path: Path) -> Tree:
 
 
 def interface(tree: Tree, change: dict[str, Any], hardware: bool = True) -> None:
-    """Let there be can0, as `ip` and /sys show it."""
+    """Add can0, as `ip` and /sys show it."""
     found = merged(controller(), change)
     tree.programs["ip",] = json.dumps([{"linkinfo": found.pop("linkinfo")}])
     for name, text in found.items():
@@ -74,20 +78,24 @@ DOWN = {"flags": "0x40040"}
     [
         ({}, PLAIN, "can.bitrate", OK, "500000 bit/s"),
         (DOWN | info(state="STOPPED"), PLAIN, "can.up", ERROR, f"{UP} restart-ms 100"),
-        (info(bittiming={"bitrate": 250000}), PLAIN, "can.bitrate", ERROR, "can0 up type can bitrate 500000"),
+        (info(bittiming={"bitrate": 250000}), PLAIN, "can.bitrate", ERROR,
+         "can0 up type can bitrate 500000"),
         (info(restart_ms=0), PLAIN, "can.restart", ERROR, "restart-ms 100"),
-        (info(berr_counter={"tx": 128, "rx": 7}), PLAIN, "can.state", OK, "error counters 128 and 7"),
+        (info(berr_counter={"tx": 128, "rx": 7}), PLAIN, "can.state", OK,
+         "error counters 128 and 7"),
         (info(state="ERROR-PASSIVE"), PLAIN, "can.state", WARNING, ""),
         (info(state="ERROR-WARNING"), PLAIN, "can.state", WARNING, "error-warning"),
         (info(state="SLEEPING"), PLAIN, "can.state", WARNING, "type can bitrate 500000"),
         (info(state="BUS-OFF"), PLAIN, "can.state", ERROR, ""),
-        (info(ctrlmode=["LISTEN-ONLY", "BERR-REPORTING"]), PLAIN, "can.mode", ERROR, "listen-only off"),
+        (info(ctrlmode=["LISTEN-ONLY", "BERR-REPORTING"]), PLAIN, "can.mode", ERROR,
+         "listen-only off"),
         (info(ctrlmode=["LOOPBACK"]), PLAIN, "can.mode", ERROR, "loopback off"),
         (info(bittiming={"bitrate": 0}), PLAIN, "can.bitrate", ERROR, "no bit rate is set"),
         ({}, FD, "can.fd", ERROR, "dbitrate 2000000 fd on"),
         (info(ctrlmode=["TRIPLE-SAMPLING"]), PLAIN, "can.state", OK, ""),
         ({"mtu": "72"} | info(data_bittiming={"bitrate": 2000000}), FD, "can.up", OK, ""),
-        ({"mtu": "72"} | info(data_bittiming={"bitrate": 4000000}), FD, "can.bitrate", ERROR, "can.data_bitrate is 2000000"),
+        ({"mtu": "72"} | info(data_bittiming={"bitrate": 4000000}), FD, "can.bitrate", ERROR,
+         "can.data_bitrate is 2000000"),
     ],
 )  # fmt: skip
 def test_a_wrong_setting_is_reported_with_the_command_that_corrects_it(
@@ -98,15 +106,14 @@ def test_a_wrong_setting_is_reported_with_the_command_that_corrects_it(
     (found,) = [each for each in findings if (each.check, each.severity) == (check, severity)]
     assert said in f"{found.text} {found.command}"
     assert severity in (OK, NOTE) or found.remedy or found.command
-    assert grave(findings).keys() == (set() if severity == OK else {check}), "one cause, told once"
+    expected = set() if severity == OK else {check}
+    assert grave(findings).keys() == expected, "a cause is reported once"
 
 
 def test_a_missing_interface_is_reported_with_the_existing_ones(tree: Tree) -> None:
     found = only(check_can(tree, PLAIN), "can.exists")
-    assert (found.severity, found.command) == (
-        ERROR,
-        "sudo ip link add can0 type vcan && sudo ip link set can0 up",
-    )
+    assert found.severity == ERROR
+    assert found.command == "sudo ip link add can0 type vcan && sudo ip link set can0 up"
     tree.file("/sys/class/net/can1/type", "280\n")
     tree.file("/sys/class/net/eth0/type", "1\n")
     assert only(check_can(tree, PLAIN), "can.exists").remedy == "Set can.channel: can1"
@@ -122,13 +129,14 @@ def test_a_virtual_interface_is_noted_and_has_its_own_commands(tree: Tree) -> No
 
 
 def test_vcan_has_its_own_commands_even_without_ip(tree: Tree) -> None:
+    vcan0 = CanConfig(channel="vcan0")
     add = "sudo ip link add vcan0 type vcan && sudo ip link set vcan0 up"
-    assert only(check_can(tree, CanConfig(channel="vcan0")), "can.exists").command == add
+    assert only(check_can(tree, vcan0), "can.exists").command == add
     tree.file("/sys/class/net/can1/type", "280\n")
-    assert only(check_can(tree, CanConfig(channel="vcan0")), "can.exists").command == add
+    assert only(check_can(tree, vcan0), "can.exists").command == add
     for name, text in (("type", "280"), ("flags", "0x80"), ("mtu", "16")):
         tree.file(f"/sys/class/net/vcan0/{name}", f"{text}\n")
-    found = check_can(tree, CanConfig(channel="vcan0"))  # without `ip`
+    found = check_can(tree, vcan0)
     assert only(found, "can.up").command == "sudo ip link set vcan0 up"
 
 
@@ -140,7 +148,7 @@ def test_a_missing_can_driver_and_another_kind_of_interface_are_reported(tree: T
 
 
 def test_slcan_is_not_asked_for_a_restart_that_it_cannot_do(tree: Tree) -> None:
-    """The kernel's slcan driver: fixed rates, no bit timing, no restart."""
+    """The slcan driver of the kernel has fixed rates, no bit timing and no restart."""
     rates = {"bittiming_bitrate": 500000, "bitrate_const": [250000, 500000]}
     change = info(bittiming=None, restart_ms=0, clock=0, **rates)
     interface(tree, change, hardware=False)

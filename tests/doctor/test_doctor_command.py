@@ -1,4 +1,7 @@
-"""The command: exit codes, the JSON document, and that nothing reaches an ESC or is changed on the disk."""
+"""The command ``doctor``: exit codes and the JSON document.
+
+It sends nothing to an ESC and changes nothing on the disk.
+"""
 
 import ast
 import json
@@ -29,20 +32,21 @@ def configuration(folder: Path, port: str, more: str = "") -> Path:
 
 
 def document(file: Path, code: int) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
-    """All findings and the errors of the JSON document, after its check."""
+    """Return all findings and the errors of the JSON document, after checking its form."""
     done = run("doctor", "-c", file, "--json")
     assert (done.code, done.err) == (code, "")
     found = json.loads(done.out)
     keys = "format version config exit_code errors warnings findings"
     assert " ".join(found) == keys
-    assert all(
-        set(f) == {"group", "check", "severity", "text", "remedy", "command"}
-        for f in found["findings"]
-    )
     assert (found["format"], found["exit_code"]) == (1, code)
-    for severity in ("error", "warning"):
-        assert found[f"{severity}s"] == sum(f["severity"] == severity for f in found["findings"])
-    return found["findings"], [f for f in found["findings"] if f["severity"] == "error"]
+    findings = found["findings"]
+    for finding in findings:
+        assert set(finding) == {"group", "check", "severity", "text", "remedy", "command"}
+    errors = [finding for finding in findings if finding["severity"] == "error"]
+    warnings = [finding for finding in findings if finding["severity"] == "warning"]
+    assert found["errors"] == len(errors)
+    assert found["warnings"] == len(warnings)
+    return findings, errors
 
 
 def test_a_usable_setup_has_exit_code_0_and_plain_text_in_a_pipe(
@@ -77,12 +81,15 @@ def test_an_error_has_its_exit_code_and_the_rest_is_still_checked(
     findings, errors = document(configuration(tmp_path, port or esc.path, more), code)
     assert [error["check"] for error in errors] == checks
     assert said in errors[0]["text"]
-    assert "Machine" in {f["group"] for f in findings}
-    assert ("Serial port of esc1" in {f["group"] for f in findings}) == ("cann" not in more)
+    groups = {finding["group"] for finding in findings}
+    assert "Machine" in groups
+    assert ("Serial port of esc1" in groups) == ("cann" not in more)
 
 
 def test_doctor_creates_and_changes_nothing(tmp_path: Path, esc: PtyEsc) -> None:
-    more = '[canopen]\nenabled = true\nstore = "not/yet"\n[record]\ndirectory = "captures"\nmin_free_mb = 0'
+    canopen = '[canopen]\nenabled = true\nstore = "not/yet"\n'
+    record = '[record]\ndirectory = "captures"\nmin_free_mb = 0'
+    more = canopen + record
     findings, _ = document(configuration(tmp_path, esc.path, more), 0)
     assert sum(f["text"].endswith(", will be made") for f in findings) == 2
     assert [p.name for p in tmp_path.iterdir()] == ["gateway.toml"]
@@ -108,9 +115,7 @@ def test_the_reason_for_missing_telemetry_is_a_warning(tmp_path: Path, esc: PtyE
     bench.silent.add(0)
     bench.run(2)
     ports = [PortFacts("esc1", esc.path, True, diagnosis=why)]
-    text = json.dumps(
-        bench.document(ports=ports, program=program_facts(str(file)))
-        | {"monotonic_ns": time.monotonic_ns()}
-    )
-    written(tmp_path / "status.json", text)
+    status = bench.document(ports=ports, program=program_facts(str(file)))
+    status |= {"monotonic_ns": time.monotonic_ns()}
+    written(tmp_path / "status.json", json.dumps(status))
     assert told() == [f"the gateway receives no telemetry: {why}"]

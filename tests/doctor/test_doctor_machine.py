@@ -1,4 +1,4 @@
-"""What `doctor` says of the machine, the service, and the folders."""
+"""Findings of `doctor` about the machine, the service and the folders."""
 
 import os
 import subprocess
@@ -96,7 +96,7 @@ def test_a_folder_must_be_writable_by_this_user_or_systemd(
     assert (found.severity, said in f"{found.text} {found.command}") == (severity, True), found
 
 
-# --- the real thing
+# --- the real machine
 
 
 def test_a_program_that_has_the_terminal_open_is_found() -> None:

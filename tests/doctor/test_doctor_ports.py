@@ -1,4 +1,4 @@
-"""What `doctor` says of a serial port, good and bad."""
+"""Findings of `doctor` at serial ports, good and bad."""
 
 import shutil
 from collections.abc import Callable
@@ -15,7 +15,9 @@ BY_ID = "/dev/serial/by-id/usb-FTDI_A1234-port0"
 
 
 RUN = ("python3", "-m", "kontronik_can_gw", "run")
-USB0, AMA0, S0 = "/dev/ttyUSB0", "/dev/ttyAMA0", "/dev/ttyS0"
+USB0 = "/dev/ttyUSB0"
+AMA0 = "/dev/ttyAMA0"
+S0 = "/dev/ttyS0"
 
 
 @pytest.fixture
@@ -53,6 +55,8 @@ MODEM_MANAGER = methodcaller("process", 78, "/usr/sbin/ModemManager")
 GETTY = methodcaller("process", 78, "/sbin/agetty", "115200", "ttyAMA0", "vt220", opens=[AMA0])
 CONSOLE = methodcaller("file", "/sys/class/tty/console/active", "tty0 ttyAMA0\n")
 RULES = methodcaller("file", "/usr/lib/udev/rules.d/70-kontronik-can-gw.rules", "")
+BRLTTY = methodcaller("process", 78, "/usr/bin/brltty")
+MINICOM = methodcaller("process", 78, "minicom", opens=[USB0])
 GATEWAY = methodcaller("process", 78, *RUN, opens=[USB0])
 INSTALLED = methodcaller(
     "process", 78, "/usr/bin/python3", "/opt/bin/kontronik-can-gw", "run", "--wait", opens=[USB0]
@@ -72,20 +76,21 @@ INSTALLED = methodcaller(
         ([UART], AMA0, "port.exists", OK, "ttyAMA0"),
         ([FTDI], USB0, "port.name", WARNING, f'port = "{BY_ID}"'),
         ([methodcaller("ftdi", "")], USB0, "port.name", WARNING, "/dev/serial/by-path/pci-usb-0:1"),
-        # who may open it
+        # permissions
         ([FTDI, closed], BY_ID, "port.permission", ERROR, "sudo usermod -aG dialout anna"),
         ([FTDI, of_root, closed], BY_ID, "port.permission", ERROR, "chmod g+rw"),
-        ([FTDI, of_root, closed, GATEWAY], BY_ID, "port.permission", NOTE, "perhaps the running gateway may"),
-        # what else is on it
-        ([FTDI, methodcaller("process", 78, "/usr/bin/brltty")], BY_ID, "port.brltty", WARNING, "apt remove brltty"),
+        ([FTDI, of_root, closed, GATEWAY], BY_ID, "port.permission", NOTE,
+         "perhaps the running gateway may"),
+        # other programs that use the port
+        ([FTDI, BRLTTY], BY_ID, "port.brltty", WARNING, "apt remove brltty"),
         ([UART, GETTY], AMA0, "port.getty", ERROR, "systemctl disable --now serial-getty@ttyAMA0"),
         ([UART, CONSOLE], AMA0, "port.console", ERROR, "Remove console=ttyAMA0"),
         ([FTDI, MODEM_MANAGER], BY_ID, "port.modem_manager", WARNING, "service install"),
-        ([FTDI, methodcaller("process", 78, "minicom", opens=[USB0])], BY_ID, "port.users", ERROR, "kill 78"),
+        ([FTDI, MINICOM], BY_ID, "port.users", ERROR, "kill 78"),
         ([FTDI, GATEWAY], BY_ID, "port.users", NOTE, "kontronik-can-gw (pid 78)"),
         ([FTDI, INSTALLED], BY_ID, "port.users", NOTE, "kontronik-can-gw (pid 78)"),
         ([FTDI], BY_ID, "port.users", NOTE, "only root can see all"),
-        # the line itself
+        # settings of the line
         ([MINI_UART], S0, "port.parity", ERROR, "dtoverlay=disable-bt"),
     ],
 )  # fmt: skip

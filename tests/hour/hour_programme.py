@@ -1,11 +1,12 @@
-"""An hour of telemetry through every command that reads recordings, and each result read back by libraries that are not ours.
+"""Converts an hour of telemetry with every command for recordings, and checks all results.
 
     python tests/hour/hour_programme.py [--minutes 60]
 
-Makes a capture of so many minutes without waiting, converts it by the real command as a process of its own, converts the CAN logs back,
-reads every file by pandas, json, pyarrow, python-can, asammdf and cantools, and compares every value of every row with what the simulated
-ESC meant (hour_truth.py); of what only the gateway knows (rates, counters, states, energy) with the first table.
-Exits with 1 and the first differences where anything is not equal.
+Makes a capture of this many minutes without waiting. Converts it with the real command in a new
+process, and converts the CAN logs back. Reads every file with pandas, json, pyarrow, python-can,
+asammdf and cantools, and compares every value of every row with the values of the simulated ESC
+(hour_truth.py). Rates, counters, states and energy are computed by the gateway alone, so they are
+compared with the first table. Exits with 1 and prints the first differences if anything differs.
 """
 
 import argparse
@@ -31,26 +32,29 @@ from hour_truth import MS, SECOND, Floats, Times, Truth, value_name
 from pyarrow import parquet  # type: ignore[import-untyped]
 
 ROWS = 20_000
+"""Rows that are read at a time."""
 SLACK = 6e-7
-"""A table has six decimals; what cantools multiplies is nearer still."""
+"""Largest difference of two values: a table has six decimals. The error of cantools is smaller."""
 LOGS = {"log": "candump", "asc": "asc", "blf": "blf", "trc": "trc", "mf4": "mf4-log"}
 
 
 @dataclass
 class Verdict:
-    """How a comparison went."""
+    """The result of a comparison."""
 
     values: int = 0
     problems: list[str] = field(default_factory=list)
 
     def compare(self, what: str, got: Any, wanted: Any, slack: float = 0.0) -> None:
-        """Two columns, of which NaN is equal to NaN."""
+        """Compare two columns. NaN equals NaN."""
         if len(got) != len(wanted):
             self.problems.append(f"{what}: {len(got)}, must be {len(wanted)}")
             return
         self.values += len(got)
-        equal = (np.abs(got - wanted) <= slack) | (np.isnan(got) & np.isnan(wanted))
-        if len(bad := np.flatnonzero(~equal)):
+        both_missing = np.isnan(got) & np.isnan(wanted)
+        equal = (np.abs(got - wanted) <= slack) | both_missing
+        bad = np.flatnonzero(~equal)
+        if len(bad):
             at = bad[0]
             first = f"the first, {at}: {got[at]}, must be {wanted[at]}"
             self.problems.append(f"{what}: {len(bad)} differ; {first}")
@@ -60,7 +64,10 @@ class Verdict:
 
 
 def csv_frames(path: Path) -> Iterator[pd.DataFrame]:
-    """By pandas. Only what is empty is missing: a word such as NotAvailable in its place would be a mistake."""
+    """Read CSV with pandas.
+
+    Only empty cells are missing values. A word such as NotAvailable instead would be a mistake.
+    """
     options: dict[str, Any] = {"keep_default_na": False, "na_values": [""], "low_memory": False}
     if int(pd.__version__.partition(".")[0]) < 3:
         options["float_precision"] = "round_trip"
@@ -68,28 +75,37 @@ def csv_frames(path: Path) -> Iterator[pd.DataFrame]:
 
 
 def jsonl_frames(path: Path) -> Iterator[pd.DataFrame]:
-    """By json."""
+    """Read JSON lines with json."""
     with path.open(encoding="utf-8") as file:
         while rows := [json.loads(line) for line in islice(file, ROWS)]:
             yield pd.DataFrame(rows, dtype=object)
 
 
 def parquet_frames(path: Path) -> Iterator[pd.DataFrame]:
-    """By pyarrow."""
-    return (batch.to_pandas() for batch in parquet.ParquetFile(path).iter_batches(ROWS))
+    """Read Parquet with pyarrow."""
+    for batch in parquet.ParquetFile(path).iter_batches(ROWS):
+        yield batch.to_pandas()
 
 
 READERS = {"csv": csv_frames, "jsonl": jsonl_frames, "parquet": parquet_frames}
 
 
 def numbers(values: Any, texts: Mapping[str, float]) -> Floats:
-    """A column as numbers; of texts those of the DBC, whose names a table may spell with other capitals."""
+    """Return a column as numbers.
+
+    Texts are replaced by the numbers that the DBC has for them. A table may spell them with other
+    capitals.
+    """
     array = np.asarray(values, dtype=object)
     if not any(isinstance(value, str) for value in array):
         return array.astype(np.float64)
-    return np.array(
-        [texts.get(v.casefold(), -999.0) if isinstance(v, str) else np.nan for v in array]
-    )
+
+    def number(value: object) -> float:
+        if isinstance(value, str):
+            return texts.get(value.casefold(), -999.0)
+        return np.nan
+
+    return np.array([number(value) for value in array])
 
 
 def nanoseconds(seconds: Any) -> Times:
@@ -104,7 +120,10 @@ def unix_ns(wall: Any) -> Times:
 
 
 def table_of(path: Path, truth: Truth) -> tuple[Times, Times | None, dict[str, Floats]]:
-    """The whole table as numbers: times, Unix times, values by name. AssertionError for a unit that is not the value's."""
+    """Return a whole table as numbers: times, Unix times, and values by name.
+
+    AssertionError if a value has a wrong unit.
+    """
     columns: dict[str, list[Any]] = {}
     for frame in READERS[path.suffix[1:]](path):
         for head, column in frame.items():
@@ -119,17 +138,22 @@ def table_of(path: Path, truth: Truth) -> tuple[Times, Times | None, dict[str, F
 
 
 def check_table(truth: Truth, known: dict[str, Floats], path: Path) -> Verdict:
-    """A table of the recording. ``known``: its columns, filled by the truth, and of the first table with what the truth does not know."""
+    """Check a table of the recording.
+
+    ``known`` has the correct columns. It is filled from the truth when the first table is checked.
+    Columns that the truth does not have are filled from that table.
+    """
     times, wall, values = table_of(path, truth)
     verdict = Verdict()
     verdict.compare("Time", times, truth.row_ns - truth.row_ns[0], 500)
-    # text cuts at a microsecond, Parquet keeps nanoseconds
+    # text is cut to microseconds, but Parquet has nanoseconds
     tolerance = 0 if path.suffix == ".parquet" else 999
     verdict.compare("Utc", wall, truth.wall_ns(truth.row_ns), tolerance)
     if not known:
         known |= values | truth.columns()
     for name in sorted(known.keys() ^ values.keys()):
-        verdict.problems.append(f"{name}: is {'missing' if name in known else 'too much'}")
+        problem = "missing" if name in known else "too much"
+        verdict.problems.append(f"{name}: is {problem}")
     for name in known.keys() & values.keys():
         verdict.compare(name, values[name], known[name], SLACK)
     return verdict
@@ -139,28 +163,39 @@ def check_table(truth: Truth, known: dict[str, Floats], path: Path) -> Verdict:
 
 
 def check_log(truth: Truth, path: Path) -> Verdict:
-    """A log of all frames: ids, bytes, times as they were handed to the interface, by python-can (MF4: by asammdf below it)."""
+    """Check the ids, the bytes and the times of a log of all frames.
+
+    The log is read by python-can, and MF4 by asammdf below it. The times are those at which the
+    frames were given to the interface.
+    """
     options: dict[str, Any] = {"relative_timestamp": False} if path.suffix == ".asc" else {}
-    times, ids, data = [], [], []
+    times = []
+    ids = []
+    data = []
     with can.LogReader(path, **options) as reader:
         for message in reader:
-            assert message.dlc == 8 and not message.is_extended_id and not message.is_rx, message
+            assert message.dlc == 8, message
+            assert not message.is_extended_id, message
+            assert not message.is_rx, message
             times.append(message.timestamp)
             ids.append(message.arbitration_id)
             data.append(bytes(message.data))
     verdict = Verdict()
-    # a converted log goes on with the clock as it began
+    # a converted log ignores that the clock was set
     wall = truth.wall_ns(truth.sent_ns[:1])[0] + truth.sent_ns - truth.sent_ns[0]
-    # its own microsecond, and half of what a float of Unix seconds can tell apart
-    verdict.compare("time", nanoseconds(times), wall, 750 + 600 * (path.suffix == ".trc"))
+    # half a microsecond of the log, and half a step of Unix seconds in a float
+    slack = 1350 if path.suffix == ".trc" else 750
+    verdict.compare("time", nanoseconds(times), wall, slack)
     verdict.compare("id", np.array(ids), truth.sent_ids)
-    got, wanted = np.frombuffer(b"".join(data), "<u8"), truth.sent_data
-    verdict.compare("data", np.flatnonzero(got != wanted) if len(got) == len(wanted) else got, [])
+    got = np.frombuffer(b"".join(data), "<u8")
+    wanted = truth.sent_data
+    different = np.flatnonzero(got != wanted) if len(got) == len(wanted) else got
+    verdict.compare("data", different, [])
     return verdict
 
 
 def decoded(truth: Truth, can_id: int) -> pd.DataFrame:
-    """What cantools reads in the frames of one id: ``ns``, when each was sent, and a column for each value."""
+    """Return the values that cantools reads from the frames of one id, with their times ``ns``."""
     rows = np.flatnonzero(truth.sent_ids == can_id)
     message = truth.database.get_message_by_frame_id(can_id)
     payloads, at = np.unique(truth.sent_data[rows], return_inverse=True)
@@ -169,30 +204,35 @@ def decoded(truth: Truth, can_id: int) -> pd.DataFrame:
     def number(name: str, value: Any) -> float:
         if str(value) in ("NotAvailable", "Error"):
             return np.nan
-        return truth.texts[name][str(value).casefold()] if hasattr(value, "value") else float(value)
+        if hasattr(value, "value"):  # a value with a name
+            return truth.texts[name][str(value).casefold()]
+        return float(value)
 
     columns = {}
     for signal in found[0]:
         name = value_name(signal)
         columns[name] = np.array([number(name, values[signal]) for values in found])[at]
-    return pd.DataFrame({"ns": truth.sent_ns[rows], "sent_ns": truth.sent_ns[rows]} | columns)
+    times = truth.sent_ns[rows]
+    return pd.DataFrame({"ns": times, "sent_ns": times} | columns)
 
 
 def check_back(truth: Truth, path: Path) -> Verdict:
-    """The CSV of a CAN log: in each row the newest value of each signal while it is fresh."""
+    """Check the CSV of a CAN log: a row has the newest value of each signal while it is fresh."""
     times, _, values = table_of(path, truth)
     verdict = Verdict()
     begun = times + truth.sent_ns[0]
-    until = pd.DataFrame({"ns": np.append(begun[1:], 1 << 62) - 1500})  # its own microsecond
+    ends = np.append(begun[1:], 1 << 62) - 1500  # times of rows are rounded to microseconds
+    until = pd.DataFrame({"ns": ends})
     flags = {value_name(flag) for flag in truth.flags}
     for can_id in np.unique(truth.sent_ids).tolist():
         newest = pd.merge_asof(until, decoded(truth, can_id), on="ns")
         cycle = truth.database.get_message_by_frame_id(can_id).cycle_time
-        # three cycles, at least 250 ms; a second where it comes with telemetry only
+        # fresh for three cycles, at least 250 ms, or for a second if it is sent on events only
         life = max(250, 3 * cycle) * MS if cycle else SECOND
         newest = newest.where(begun - newest.pop("sent_ns") <= life)
         for name in values.keys() & newest.keys():
-            got, wanted = values[name], newest[name].to_numpy()
+            got = values[name]
+            wanted = newest[name].to_numpy()
             if name in flags:  # a flag has no code for not available
                 wanted = np.where(np.isnan(got), np.nan, wanted)
             verdict.compare(name, got, wanted, SLACK)
@@ -203,25 +243,25 @@ def check_back(truth: Truth, path: Path) -> Verdict:
 
 
 def check_frames(truth: Truth, _: Path) -> Verdict:
-    """Every signal of every frame against what the ESC meant."""
+    """Compare every signal of every frame with the values of the ESC."""
     found = truth.judged_frames()
     return Verdict(found.count["values"], found.wrong)
 
 
 def check_bytes(truth: Truth, path: Path) -> Verdict:
-    """The UART bytes of the ESC."""
+    """Compare the UART bytes of the ESC."""
     verdict = Verdict()
     got = np.fromfile(path, np.uint8).astype(int)
     verdict.compare("bytes", got, np.frombuffer(truth.wire, np.uint8).astype(int))
     return verdict
 
 
-# --- the programme
+# --- the steps
 
 
 @dataclass
 class Step:
-    """A command that makes a file, and what is compared."""
+    """A command that writes a file, and the check of the file."""
 
     name: str
     words: list[str]
@@ -229,7 +269,7 @@ class Step:
     check: Callable[[Path], Verdict]
 
     def run(self) -> Verdict:
-        """RuntimeError where the command failed."""
+        """Run the command and check the file. RuntimeError if the command failed."""
         command = [sys.executable, "-m", "kontronik_can_gw", *self.words, str(self.output)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
@@ -238,17 +278,21 @@ class Step:
 
 
 def steps_of(folder: Path, truth: Truth) -> list[Step]:
-    """All that is done with the capture."""
-    convert, known = ["convert", str(truth.path)], dict[str, Floats]()
+    """Return all steps for the capture, in the order in which they must be run."""
+    convert = ["convert", str(truth.path)]
+    known: dict[str, Floats] = {}
     table = partial(check_table, truth, known)
-    log, back = partial(check_log, truth), partial(check_back, truth)
-    steps = [
-        *(Step(f"convert to {form}", convert, folder / f"hour.{form}", table) for form in READERS),
-        Step("convert to bin", convert, folder / "esc1.bin", partial(check_bytes, truth)),
-        Step("the CAN frames", convert, folder / "sent.log", partial(check_frames, truth)),
-    ]
+    log = partial(check_log, truth)
+    back = partial(check_back, truth)
+    steps = []
+    for form in READERS:
+        steps.append(Step(f"convert to {form}", convert, folder / f"hour.{form}", table))
+    bytes_step = Step("convert to bin", convert, folder / "esc1.bin", partial(check_bytes, truth))
+    frames_step = Step("the CAN frames", convert, folder / "sent.log", partial(check_frames, truth))
+    steps += [bytes_step, frames_step]
     for form, to in LOGS.items():
-        made, of_log = folder / f"hour.{form}", folder / f"of_{form}.csv"
+        made = folder / f"hour.{form}"
+        of_log = folder / f"of_{form}.csv"
         steps.append(Step(f"convert to {form}", [*convert, "--to", to], made, log))
         steps.append(Step(f"convert {form} to csv", ["convert", str(made)], of_log, back))
     return steps
@@ -266,7 +310,8 @@ def main() -> int:
             found = step.run()
             result = f"{step.name}: {found.values} values compared"
             print(result, *found.problems[:12], sep="\n    ", flush=True)
-            bad += [step.name] if found.problems or not found.values else []
+            if found.problems or not found.values:
+                bad.append(step.name)
     print(f"\nnot equal: {', '.join(bad)}" if bad else "\nall equal")
     return 1 if bad else 0
 

@@ -1,7 +1,8 @@
-"""A capture of any length of one ESC, made without waiting, and the truth of it: what the simulated ESC meant, frame by frame.
+"""A capture of one ESC, made without waiting, and the values that the simulated ESC sent.
 
-In it: dropouts, a port that is unplugged, devices that are swapped (one gives no BEC current), errors for a while, a bus in trouble, a wall
-clock that is set. What follows from the frames is worked out by the golden set's judge (tests/golden/judge.py), by the sheet.
+The capture has any length. It contains dropouts, an unplugged port, swapped devices (one without a
+BEC current), errors for a while, problems of the bus, and a change of the wall clock. The judge of
+the golden set (tests/golden/judge.py) computes the correct values from the frames and the sheet.
 """
 
 import random
@@ -14,8 +15,10 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "golden"))
 
 import judge
+import judged_esc
 import meaning
 import numpy as np
+from cantools.database.can.signal import Signal
 from capture_bench import START, Bench, capture_file, made
 from esc.reference import form_row
 from numpy.typing import NDArray
@@ -41,15 +44,16 @@ MS = 1_000_000
 SECOND = 1000 * MS
 WALL = 1_790_000_000 * SECOND + 250_004_000
 CLOCK_STEP = 1_500_250_000
-"""The wall clock is set by so much in the middle."""
+"""The wall clock is moved by this time in the middle."""
 BYTE_NS = 11 * SECOND // 115_200
 SAME_ROW_NS = 5 * MS
-"""What comes so soon after a row's begin belongs to it."""
-POLE_PAIRS, GEAR = 5, Fraction(17, 2)
+"""Info data received within this time after the start of a row is part of that row."""
+POLE_PAIRS = 5
+GEAR = Fraction(17, 2)
 
 
 def options_of(length: int) -> EscOptions:
-    """What ESC it is, and what happens to it in so many ns."""
+    """Return the options of the ESC, with the faults of a flight of this length in ns."""
     windows = (
         ErrorWindow(OperatingError.UNDERVOLTAGE, length // 5, length // 20),
         ErrorWindow(OperatingError.OPERATING_ERROR_FOUND, length // 5, length // 19),
@@ -65,10 +69,11 @@ def options_of(length: int) -> EscOptions:
 
 
 class Truth:
-    """A capture of so many seconds at ``path``, and what is true of it at any time."""
+    """A capture of this many seconds at ``path``, and its correct values at any time."""
 
     def __init__(self, path: Path, seconds: float) -> None:
-        self.path, self.length = path, int(seconds * SECOND)
+        self.path = path
+        self.length = int(seconds * SECOND)
         self.end_ns = START + self.length
         self.clock_set_ns = START + self.length // 2 + 1
         lost = START + self.length * 7 // 10
@@ -78,42 +83,60 @@ class Truth:
         wired = self._record(bench)
         path.write_bytes(capture_file(bench.setup, bench.entries, wall_ns=WALL))
         self.wire = b"".join(one.wire for one in wired)
-        self._sent = [(one.time_ns, one.frame) for one in bench.sent]
-        self.sent_ns = np.array([now for now, _ in self._sent], np.int64)
-        self.sent_ids = np.array([frame.can_id for _, frame in self._sent], np.int64)
-        self.sent_data = np.frombuffer(b"".join(f.data for _, f in self._sent), "<u8").copy()
-        assert bench.setup.dbc is not None
-        self.database = meaning.database(bench.setup.dbc[1])
-        self.signals = {
-            value_name(signal.name): signal
-            for message in self.database.messages
-            for signal in message.signals
-        }
-        self.texts = {
-            name: {str(text).casefold(): float(n) for n, text in (signal.choices or {}).items()}
-            for name, signal in self.signals.items()
-        }
-        signs = {"degC": "°C", "us": "µs", None: ""}
-        self.units = {name: signs.get(one.unit, one.unit) for name, one in self.signals.items()}
-        self._inputs: list[tuple[int, judge.Arrivals | None]] = [(lost, None)]
+        self._keep_sent(bench)
+        self._read_dbc(bench)
+        self._inputs: list[tuple[int, judged_esc.Arrivals | None]] = [(lost, None)]
         for one in wired:
             kind = "live" if isinstance(one.data, LiveData) else "info"
             is_v4 = len(one.wire) == form_row(kind, "v4").length
+            layout = "v4" if is_v4 else "legacy"
             end = one.time_ns + len(one.wire) * BYTE_NS
-            meant = kind, "v4" if is_v4 else "legacy", one.data._asdict(), end
-            self._inputs.append((end, [meant]))
+            self._inputs.append((end, [(kind, layout, one.data._asdict(), end)]))
         self._inputs.sort(key=lambda given: given[0])
         self.flags = judge.flags()
         self._rows = self._follow()
         self.row_ns = np.array([now for now, *_ in self._rows], np.int64)
 
+    def _keep_sent(self, bench: Bench) -> None:
+        """Keep the frames given to the interface, with their times."""
+        self._sent = [(one.time_ns, one.frame) for one in bench.sent]
+        frames = [frame for _, frame in self._sent]
+        data = b"".join(frame.data for frame in frames)
+        self.sent_ns = np.array([now for now, _ in self._sent], np.int64)
+        self.sent_ids = np.array([frame.can_id for frame in frames], np.int64)
+        self.sent_data = np.frombuffer(data, "<u8").copy()
+
+    def _read_dbc(self, bench: Bench) -> None:
+        """Read the signals of the DBC, their texts and their units, by the names of columns."""
+        assert bench.setup.dbc is not None
+        self.database = meaning.database(bench.setup.dbc[1])
+        self.signals: dict[str, Signal] = {}
+        self.texts: dict[str, dict[str, float]] = {}
+        self.units: dict[str, str] = {}
+        signs = {"degC": "°C", "us": "µs"}
+        for message in self.database.messages:
+            for signal in message.signals:
+                name = value_name(signal.name)
+                unit = signal.unit or ""
+                texts = {}
+                for number, text in (signal.choices or {}).items():
+                    texts[str(text).casefold()] = float(number)
+                self.signals[name] = signal
+                self.texts[name] = texts
+                self.units[name] = signs.get(unit, unit)
+
     def _record(self, bench: Bench) -> list[Wired]:
-        """Let the gateway run; the frames that left on the line. A frame comes whole or in two pieces."""
-        gateway, chance = bench.gateway, random.Random(1)
+        """Let the gateway run. Returns the frames sent on the line.
+
+        A frame is read whole or in two pieces.
+        """
+        gateway = bench.gateway
+        chance = random.Random(1)
         wired: list[Wired] = []
 
         lost, again = self.unplugged
-        trouble, wall = START + self.length // 4, self.clock_set_ns - START + WALL + CLOCK_STEP
+        trouble = START + self.length // 4
+        wall = self.clock_set_ns - START + WALL + CLOCK_STEP
         clock = Entry(self.clock_set_ns, Kind.CLOCK, 0, numbers_data(wall))
         happenings: list[tuple[int, Callable[[int], object]]] = [
             (trouble, lambda at: gateway.set_can_state(CanState.ERROR_WARNING, at)),
@@ -124,9 +147,11 @@ class Truth:
         ]
 
         def happens(what: Callable[[int], object], at: int) -> None:
-            while (due := gateway.next_deadline()) < at:
+            due = gateway.next_deadline()
+            while due < at:
                 gateway.advance(due)
                 bench.take(due)
+                due = gateway.next_deadline()
             what(at)
             gateway.advance(at)
             bench.take(at)
@@ -156,12 +181,13 @@ class Truth:
         return wired
 
     def wall_ns(self, times: Times) -> Times:
-        """Unix time in ns."""
-        wall: Times = times - START + WALL + np.where(times >= self.clock_set_ns, CLOCK_STEP, 0)
+        """Return Unix times in ns."""
+        steps = np.where(times >= self.clock_set_ns, CLOCK_STEP, 0)
+        wall: Times = times - START + WALL + steps
         return wall
 
     def judged_frames(self) -> judge.Judge:
-        """Every frame that was handed to the interface against what the ESC meant."""
+        """Judge every frame given to the interface by the values of the ESC."""
         found = judge.Judge([_esc()], self.database, [])
         steps: list[tuple[int, int, Any]] = [(now, 0, given) for now, given in self._inputs]
         steps += [(now, 1, frame) for now, frame in self._sent]
@@ -173,27 +199,34 @@ class Truth:
         return found
 
     def columns(self) -> dict[str, Floats]:
-        """Those of a table that follow from what the ESC meant: a row at each of ``row_ns``; NaN: not available; texts as numbers."""
+        """Return the columns of a table that follow from the values of the ESC.
+
+        There is a row at each of ``row_ns``. Texts are numbers, and NaN means not available.
+        """
         found = {}
         for name, signal in self.signals.items():
             try:
                 values = [self._value(signal.name, now, state) for _, now, state in self._rows]
-            except KeyError:  # only the gateway knows it
+            except KeyError:  # computed by the gateway alone
                 continue
             found[name] = np.array(values, np.float64)
         return found
 
-    def _value(self, signal: str, now: int, state: judge.State) -> float:
+    def _value(self, signal: str, now: int, state: judged_esc.State) -> float:
         if signal in self.flags:
             word, bit = self.flags[signal]
-            values = state.live if word in judge.LIVE else state.info
+            values = state.live if word in judged_esc.LIVE else state.info
             return np.nan if values is None else values[word] >> bit & 1
-        value = judge.expected(signal, _esc(), state, now)
+        value = judged_esc.expected(signal, _esc(), state, now)
         return np.nan if value is None else float(value)
 
-    def _follow(self) -> list[tuple[int, int, judge.State]]:
-        """A row with each live frame and each loss of the ESC: its time, when the last of it was read, and what was known then."""
-        esc, rows = _esc(), list[tuple[int, int, judge.State]]()
+    def _follow(self) -> list[tuple[int, int, judged_esc.State]]:
+        """Return a row for each live frame and each loss of the ESC.
+
+        A row has its time, the time at which its last frame was read, and the state at that time.
+        """
+        esc = _esc()
+        rows: list[tuple[int, int, judged_esc.State]] = []
         for now, arrivals in [*self._inputs, (self.end_ns, [])]:
             before = esc.state
             due = (before.live_ns or 0) + esc.timeout + 1
@@ -211,11 +244,10 @@ class Truth:
         return rows
 
 
-def _esc() -> judge.Esc:
-    return judge.Esc("", POLE_PAIRS, GEAR)
+def _esc() -> judged_esc.Esc:
+    return judged_esc.Esc("", POLE_PAIRS, GEAR)
 
 
 def value_name(signal: str) -> str:
-    """How a table calls a signal of the DBC: by the value that it holds."""
-    text = signal.removesuffix("Percent")
-    return "".join(f"_{c.lower()}" if c.isupper() else c for c in text).lstrip("_")
+    """Return the name of a signal's column in a table, which is the name of its value."""
+    return judged_esc.snake(signal)

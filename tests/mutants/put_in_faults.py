@@ -38,14 +38,17 @@ class Fault:
 
     def put_in(self, project: Path = PROJECT) -> tuple[Path, str]:
         """Return the file and its text with the fault. ValueError if it does not fit the code."""
-        # with any white space
+        # any white space may be between the words
         pattern = re.compile(r"\s+".join(map(re.escape, self.search.split())))
         folder = project / "kontronik_can_gw"
-        files = [file for file in folder.rglob("*") if file.suffix in SUFFIXES]
-        found = [(file, match) for file in files for match in pattern.finditer(file.read_text())]
+        found = []
+        for file in folder.rglob("*"):
+            if file.suffix in SUFFIXES:
+                found += [(file, match) for match in pattern.finditer(file.read_text())]
         if len(found) != 1:
             raise ValueError(
-                f"its text stands in {len(found)} places instead of one: write it anew for the present code"
+                f"its text is in {len(found)} places instead of one: "
+                "write it again for the present code"
             )
         file, match = found[0]
         text = match.string
@@ -114,12 +117,13 @@ def tested(copy: Path, tests: tuple[str, ...], core_in_c: bool) -> int | str:
 
 
 def faults(path: Path = LIST) -> list[Fault]:
-    """The faults of a list. ValueError for one that is not whole."""
+    """Return the faults of a list. ValueError if one of them is incomplete."""
     listed = tomllib.loads(path.read_text())["fault"]
     for number, each in enumerate(listed):
         if set(each) != {"what", "search", "replace", "seen_by"} or not each["seen_by"]:
             raise ValueError(
-                f"{path.name}: fault {number + 1} needs what, search, replace, seen_by, and nothing else"
+                f"{path.name}: fault {number + 1} needs what, search, replace, seen_by, "
+                "and nothing else"
             )
     return [Fault(**each | {"seen_by": tuple(each["seen_by"])}) for each in listed]
 

@@ -1,6 +1,7 @@
-"""Pictures of the live screen and of a report, for the pages: python tests/readme/pictures.py [FOLDER]
+"""Draws pictures of the live screen and of a report: python tests/readme/pictures.py [FOLDER]
 
-Without FOLDER those that pages show, in docs/pictures; else all kinds, to look at. Run by `make pictures`, which has the path.
+Without FOLDER it writes the pictures of the pages into docs/pictures. With FOLDER it writes all
+kinds of pictures there. `make pictures` runs it with the right path of modules.
 """
 
 import base64
@@ -33,17 +34,19 @@ SHOWN = ("monitor_1_80.svg", "monitor_4_80.svg", "report_desktop.png")
 
 
 def option(first_error_s: float) -> EscOptions:
-    """An ESC in flight whose battery is empty for a while."""
-    begin, length = int(first_error_s * SECOND_NS), 4 * SECOND_NS
+    """Return the options of an ESC in flight whose battery is empty for 4 s."""
+    begin = int(first_error_s * SECOND_NS)
+    length = 4 * SECOND_NS
     window = ErrorWindow(OperatingError.UNDERVOLTAGE, begin, length)
     return EscOptions(profile=FLYING, faults=Faults(errors=(window,)))
 
 
 def monitors(folder: Path) -> None:
-    """One and four ESCs after half a minute."""
+    """Draw the screen of one and of four ESCs after half a minute."""
     for count in (1, 4):
         bus = layout_of([f"esc{number + 1}" for number in range(count)])
-        monitor, source = Monitor(bus), Source("can0", bus)
+        monitor = Monitor(bus)
+        source = Source("can0", bus)
         monitor.advance(0)
         for now, frame in flight(bus, 31, [option(28)]):
             monitor.take(frame, now)
@@ -54,7 +57,7 @@ def monitors(folder: Path) -> None:
             for line in screen(monitor, source, size, 0):
                 console.print(line, no_wrap=True)
             picture = console.export_svg(title="kontronik-can-gw monitor", unique_id="m")
-            # letters of the reader's own machine, not from a server
+            # letters of the reader's machine, not from a server
             picture = re.sub(r"@font-face \{.*?\}\s*", "", picture, flags=re.DOTALL)
             font = "font-family: Fira Code"
             picture = picture.replace(font, f"{font}, DejaVu Sans Mono")
@@ -62,16 +65,18 @@ def monitors(folder: Path) -> None:
 
 
 def reports(folder: Path) -> None:
-    """Two ESCs, on a desktop, in the dark and on a phone."""
+    """Draw the report of two ESCs, on a desktop, in the dark and on a phone."""
     with tempfile.TemporaryDirectory() as scratch:
-        log, page = Path(scratch, "flight.log"), Path(scratch, "flight.html")
+        log = Path(scratch, "flight.log")
+        page = Path(scratch, "flight.html")
         toml = Path(scratch, "gateway.toml")
-        escs = [
-            f'[[esc]]\nname = "{name}"\nport = "/dev/tty{name}"\npole_pairs = 7\ngear = 9.8\n'
-            for name in ("left", "right")
-        ]
-        toml.write_text("".join(escs))
-        write_log(log, flight(layout_of(["left", "right"]), 120, [option(70)]))
+        names = ("left", "right")
+        text = ""
+        for name in names:
+            text += f'[[esc]]\nname = "{name}"\nport = "/dev/tty{name}"\n'
+            text += "pole_pairs = 7\ngear = 9.8\n"
+        toml.write_text(text)
+        write_log(log, flight(layout_of(names), 120, [option(70)]))
         done = run("report", log, "-c", toml, "-o", page)
         assert done.code == 0, done.err
         with Browser(Path(scratch, "profile")) as browser:

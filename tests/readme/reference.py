@@ -1,4 +1,4 @@
-"""The pages of docs/reference, made from their sources. ``make docs`` writes them."""
+"""The pages of docs/reference, generated from their sources. ``make docs`` writes them."""
 
 import re
 from argparse import SUPPRESS
@@ -20,8 +20,9 @@ LEAD = "Made by make docs: change the sources, not this page."
 
 
 def pages() -> Iterator[tuple[str, str]]:
-    """Name and text of each page."""
-    bus, canopen = layout_of_dbc(shipped("dbc/kontronik_esc.dbc")), shipped_canopen([1])
+    """Yield the name and the text of each page."""
+    bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
+    canopen = shipped_canopen([1])
     made = {
         "configuration": ("Configuration", configuration()),
         "dbc": ("The shipped DBC", dbc(bus, bus.escs)),
@@ -38,10 +39,17 @@ def _commands() -> Iterator[Table]:
     for name, line in COMMANDS.items():
         module = import_module(f"kontronik_can_gw.cli.{name}")
         parts = module.EPILOG.strip().split("\n\n")
-        text = [Code(part) if re.search(r"^  |   ", part, re.MULTILINE) else part for part in parts]
+        text = [_code_or_text(part) for part in parts]
         yield Table(name, [_sentence(line), *text], list(_options(module.OPTIONS)))
         for action, (about, options) in getattr(module, "ACTIONS", {}).items():
             yield Table(f"{name} {action}", [_sentence(about)], list(_options(options)))
+
+
+def _code_or_text(part: str) -> Code | str:
+    """Return a paragraph of help as code if it has columns or an indent."""
+    if re.search(r"^  |   ", part, re.MULTILINE):
+        return Code(part)
+    return part
 
 
 def _sentence(line: str) -> str:
@@ -54,11 +62,12 @@ def _options(rows: Rows) -> Iterable[Row]:
         if isinstance(row, Option):
             if row.settings["help"] is SUPPRESS:
                 continue
-            typed, value = ", ".join(row.names), row.settings.get("metavar")
-            if value and typed.startswith("-"):
-                typed += f" {value}"
+            typed = ", ".join(row.names)
+            value = row.settings.get("metavar")
+            if value:
+                typed = f"{typed} {value}" if typed.startswith("-") else value
             yield {
-                "option": value if value and not typed.startswith("-") else typed,
+                "option": typed,
                 "choices": list(row.settings.get("choices") or ()),
                 "required": bool(row.settings.get("required")),
                 "meaning": row.settings["help"].replace("%%", "%"),

@@ -1,8 +1,9 @@
-"""The blocks of shell commands and Python in README, CONTRIBUTING, docs and examples, as a reader would run them.
+"""The blocks of shell commands and Python in the pages, run as a reader would run them.
 
-The word after ``sh`` is the place in which a block can be run: any machine without a word, as root on a kernel with
-vcan for ``vcan``. ``root``, ``systemd``, ``network`` and ``hardware`` are things that no test has or may change.
-Python is run as root on a kernel with vcan.
+The pages are README, CONTRIBUTING, docs and examples. The word after ``sh`` names the place in
+which a block can be run. Without a word, it can be run on any machine. A block with ``vcan`` is run
+as root on a kernel with vcan, and so are blocks of Python. No test has or may change the things
+called ``root``, ``systemd``, ``network`` and ``hardware``.
 """
 
 import contextlib
@@ -27,11 +28,14 @@ PAGES = (
 )
 WORDS = ("", "vcan", "root", "systemd", "network", "hardware")
 LIMIT_S = 60
-"""Ends a block that hangs, so that what it printed is shown. No block needs a quarter of it."""
+"""A block that hangs is ended after this time, so that its output is shown.
+
+No block needs a quarter of it.
+"""
 
 
 class Block(NamedTuple):
-    """A block of a page. ``word``: one of WORDS for shell commands, "" for another language."""
+    """A block of a page. ``word`` is one of WORDS for a shell block, and "" for other languages."""
 
     place: str
     word: str
@@ -39,13 +43,15 @@ class Block(NamedTuple):
 
 
 def blocks(*words: str, language: str = "sh") -> list[Block]:
-    """The blocks of a language that have one of these words."""
+    """Return the blocks of a language that have one of these words. No words: all blocks."""
+    block = re.compile(
+        rf"^```{language} *(.*)\n([^`]*(?:`[^`]+`[^`]*)*?)^```$",
+        re.MULTILINE,
+    )
     found = []
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
-        for match in re.finditer(
-            rf"^```{language} *(.*)\n([^`]*(?:`[^`]+`[^`]*)*?)^```$", text, re.MULTILINE
-        ):
+        for match in block.finditer(text):
             line = text.count("\n", 0, match.start()) + 1
             place = f"{page.relative_to(PROJECT)}:{line}"
             found.append(Block(place, match[1], match[2]))
@@ -53,7 +59,11 @@ def blocks(*words: str, language: str = "sh") -> list[Block]:
 
 
 def make_files(folder: Path, channel: str, seconds: float) -> None:
-    """Files that blocks name: a configuration, a capture, a CAN log, a DBC, and the examples. ``seconds``: length of the flight."""
+    """Create the files that blocks name.
+
+    These are a configuration, a capture, a CAN log, a DBC and the examples. ``seconds`` is the
+    length of the flight.
+    """
     example = run("init", "-").out.replace('"can0"', f'"{channel}"')
     written(folder / "gateway.toml", re.sub("(?m)^port = .*", 'port = "esc1"', example))
     setup, layout = made()
@@ -68,7 +78,10 @@ def make_files(folder: Path, channel: str, seconds: float) -> None:
 
 
 def run_block(block: Block, folder: Path, before: str = "", *around: str) -> str:
-    """What a block prints, run in a folder by bash. A command that fails fails the test, and what it has started is ended."""
+    """Run a block in a folder with bash and return its output.
+
+    A failing command fails the test. All processes that the block has started are ended.
+    """
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     with (folder / "printed").open("w+") as printed:
         process = subprocess.Popen(
@@ -86,7 +99,7 @@ def run_block(block: Block, folder: Path, before: str = "", *around: str) -> str
         except subprocess.TimeoutExpired:
             code = f"no end within {LIMIT_S} s"
         finally:
-            with contextlib.suppress(ProcessLookupError):  # nothing was left
+            with contextlib.suppress(ProcessLookupError):  # all its processes have ended
                 os.killpg(process.pid, signal.SIGKILL)
     said = (folder / "printed").read_text()
     assert (code, "Traceback" in said) == (0, False), f"{block.place}:\n{block.text}\n{said}"

@@ -1,6 +1,7 @@
-"""README.md, docs/ and examples/ are true: tables are those of the sources, commands exist, links lead somewhere, examples are valid.
+"""README.md, docs/ and examples/ are right.
 
-Shell blocks can be typed as they stand, on any machine; tests/vcan has those that need a CAN interface.
+Tables match the sources, commands exist, links lead to pages, and examples are valid. Shell blocks
+can be typed as they are written, on any machine. Those that need a CAN interface are in tests/vcan.
 """
 
 import json
@@ -42,21 +43,30 @@ def test_the_reference_matches_the_sources() -> None:
 def test_the_reference_has_every_key_of_every_table() -> None:
     rows = set(re.findall(r"^\| (\w+) \|", PAGES[FOLDER / "configuration.md"], re.MULTILINE))
     tables = schema()["properties"].values()
-    keys = {
-        key
-        for table in (table.get("items", table) for table in tables)
-        for key, entry in table["properties"].items()
-        if "deprecated" not in entry
-    }
+    keys = set()
+    for table in tables:
+        entries = table.get("items", table)["properties"]
+        keys |= {key for key, entry in entries.items() if "deprecated" not in entry}
     assert rows - {"key"} == keys
 
 
 def anchors(text: str) -> set[str]:
-    """Those that a page has, as GitHub makes them of its headings."""
-    headings = re.findall(
-        r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE
-    )
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    """Return the anchors of a page, which GitHub derives from its headings."""
+    without_blocks = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    found = set()
+    for heading in re.findall(r"^#+ (.+)$", without_blocks, re.MULTILINE):
+        words = re.sub(r"[^\w\- ]", "", heading.lower())
+        found.add(words.replace(" ", "-"))
+    return found
+
+
+def link_targets(pattern: str) -> set[Path]:
+    """Return the files to which all pages link. The pattern's group is the link."""
+    found = set()
+    for path, text in PAGES.items():
+        for link in re.findall(pattern, text):
+            found.add((path.parent / link).resolve())
+    return found
 
 
 def test_links_lead_to_files_and_headings() -> None:
@@ -71,19 +81,15 @@ def test_links_lead_to_files_and_headings() -> None:
 
 
 def test_every_page_can_be_reached_from_the_front_page() -> None:
-    linked = {
-        (path.parent / link).resolve()
-        for path, text in PAGES.items()
-        for link in re.findall(r"\]\(([^):#]+\.md)", text)
-    }
+    linked = link_targets(r"\]\(([^):#]+\.md)")
     assert set(PAGES) - {PROJECT / "README.md"} <= linked
     assert README.count("\n") <= 230
 
 
 def test_configurations_are_valid() -> None:
     for block in re.findall(r"```toml\n(.*?)```", ALL, re.DOTALL):
-        # some show a table alone
-        parse({"esc": [{"port": "/dev/ttyUSB0"}]} | tomllib.loads(block), "README.md")
+        least = {"esc": [{"port": "/dev/ttyUSB0"}]}  # some blocks are a single table
+        parse(least | tomllib.loads(block), "README.md")
 
 
 def test_json_blocks_are_valid() -> None:
@@ -110,11 +116,7 @@ def test_every_documented_make_target_exists() -> None:
 
 
 def test_pictures_are_in_use_and_small_and_load_nothing() -> None:
-    shown = {
-        (path.parent / link).resolve()
-        for path, text in PAGES.items()
-        for link in re.findall(r"!\[[^]]+\]\(([^)]+)\)", text)
-    }
+    shown = link_targets(r"!\[[^]]+\]\(([^)]+)\)")
     assert shown == set((PROJECT / "docs/pictures").iterdir())
     assert shown == {PROJECT / "docs/pictures" / name for name in SHOWN}
     for path in shown:
@@ -146,7 +148,9 @@ def test_check_accepts_each_example_without_a_warning(file: Path) -> None:
 )
 def test_the_dbc_of_an_example_is_the_output_of_the_command(file: str, words: list[str]) -> None:
     for dbc in EXAMPLES.glob(f"*/{file}"):
-        assert run("dbc", *words, "-c", dbc.with_name("gateway.toml")).data == dbc.read_bytes(), dbc
+        configuration = dbc.with_name("gateway.toml")
+        done = run("dbc", *words, "-c", configuration)
+        assert done.data == dbc.read_bytes(), dbc
 
 
 def test_every_example_has_its_dbc() -> None:
@@ -175,7 +179,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def given(block: Block) -> object:
-    """A block as a parameter; libraries of tables take their time."""
+    """Return a block as a parameter. Blocks with Parquet are slow because of their libraries."""
     marks = [pytest.mark.extended] if "parquet" in block.text else []
     return pytest.param(block, id=block.place, marks=marks)
 

@@ -1,4 +1,5 @@
-/* The bus: a local socket that keeps frames apart stands for a CAN interface; NAME in the abstract space leaves no file behind. */
+/* The bus: a local socket that keeps frames separate replaces a CAN interface. Its name is in the
+   abstract namespace, so that no file remains. */
 #include <errno.h>
 #include <linux/can.h>
 #include <stddef.h>

@@ -1,12 +1,19 @@
-/* The ESCs and the bus's other end: writes telemetry to pseudo terminals, receives and checks the CAN frames, measures the delay.
+/* The ESCs and the other end of the bus: writes telemetry to pseudo terminals, receives and checks
+   the CAN frames, and measures their delay.
 
        feeder [--escs N] [--seconds S] [--warmup S] [--period US] [--priority P] [--sdo] --bus BUS
 
-   BUS as in bus.h. Prints lines of JSON: {"ports": [...]}; once the gateway has sent a frame and the warm-up is over
-   {"begin": live frames so far}; at the end {"end": ...}; then the results. Every CAN frame with an id of
-   five.dbc is compared with what the frames written say it must hold, in their order. The delay is from the write of a frame's last byte
-   to the receipt of the fifth CAN frame that belongs to it.
-   --sdo: be a CANopen master that asks nodes 1..N in turn, 200 times a second in all, for 20 objects. */
+   BUS: see bus.h. Prints lines of JSON:
+
+   1. {"ports": [...]} at the start,
+   2. {"begin": number of UART frames of live data} after the gateway's first frame and the warm-up,
+   3. {"end": ...} with the same number at the end,
+   4. the results.
+
+   Every CAN frame with an id of five.dbc is compared with the UART frames written, in their order.
+   The delay is the time from the write of the last byte of a UART frame to the receipt of its fifth
+   CAN frame. With --sdo the feeder is also a CANopen master. It asks nodes 1..N in turn for one of
+   20 objects, 200 times a second in total. */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <poll.h>
@@ -103,7 +110,7 @@ static void put(uint8_t *p, uint64_t v, int n)
     memcpy(p, &v, n);
 }
 
-/* The next live frame of an ESC, V4, and what the five CAN frames must hold. */
+/* Write the next V4 frame of live data of an ESC, and the expected data of its five CAN frames. */
 static void make_live(struct esc *e)
 {
     uint8_t *f = e->frame;
@@ -176,7 +183,7 @@ static void write_all(struct esc *e, const uint8_t *data, int length)
 static void step(struct esc *e)
 {
     int info = e->due >= e->next_info;
-    if (info) { /* goes just in front of a live one */
+    if (info) { /* an info frame is sent directly before a frame of live data */
         make_info(e);
         e->next_info += 1000000000;
     } else {
@@ -289,7 +296,7 @@ static int new_port(char *name, int size, int *slave)
     struct termios t;
     if (fd < 0 || grantpt(fd) < 0 || unlockpt(fd) < 0 || ptsname_r(fd, name, size))
         die("pseudo terminal");
-    *slave = open(name, O_RDWR | O_NOCTTY | O_CLOEXEC); /* held open, so that there is no hang-up */
+    *slave = open(name, O_RDWR | O_NOCTTY | O_CLOEXEC); /* kept open to prevent a hang-up */
     if (*slave < 0 || tcgetattr(*slave, &t) < 0)
         die(name);
     cfmakeraw(&t);
@@ -313,7 +320,7 @@ static int accept_gateway(void)
         if (p[0].revents)
             break;
         if (p[1].revents && read(0, line, sizeof line) <= 0)
-            exit(0); /* who started us has gone */
+            exit(0); /* the parent process has ended */
     }
     int fd = accept4(listener, NULL, NULL, SOCK_CLOEXEC);
     if (fd < 0)
@@ -424,7 +431,7 @@ int main(int argc, char **argv)
     pthread_create(&thread, NULL, receiver, NULL); /* has our priority */
     while (!received && !stopping)
         sleep_until(now_ns() + 1000000);
-    sleep_until(now_ns() + 300000000); /* a gateway looks round once more behind its start */
+    sleep_until(now_ns() + 300000000); /* a gateway does more work after its start */
     if (sdo)
         pthread_create(&sdo_thread, NULL, master, NULL);
     feed(seconds, warmup);

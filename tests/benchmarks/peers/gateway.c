@@ -1,10 +1,13 @@
-/* The floor: what a gateway costs in plain C. One epoll loop over serial ports, five CAN frames for each live frame (five.dbc).
+/* The least CPU time that a gateway needs, in plain C. One epoll loop reads all serial ports and
+   sends five CAN frames for each UART frame of live data (five.dbc).
 
        gateway BUS PORT...        BUS: see bus.h
 
-   The same rules as ours where they show on the bus: all four frame forms, the CRC over the largest multiple of four bytes, the shorter
-   form first, a search byte by byte behind what is no frame; Error codes for what does not fit; NotAvailable at the start, 250 ms behind
-   the last live frame, and for the BEC current of a JIVEPro. */
+   Rules with an effect on the bus are the same as in the real gateway. It reads all four frame
+   forms, the shorter form first. The CRC covers the largest multiple of four bytes. After bytes
+   that are not a frame it continues its search with the next byte. Values that do not fit are sent
+   as Error. All values are NotAvailable at the start and 250 ms after the last UART frame of live
+   data. The BEC current of a JIVEPro is always NotAvailable. */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <signal.h>
@@ -100,7 +103,9 @@ static void send_five(int esc, const uint64_t bits[5])
 
 static void not_available(int esc)
 {
-    static const uint64_t bits[5] = {0xFFFFFFFFFFFFFFFF, 0xFF80800080008000, 0xFFFFFFFFFF, 0x8080FFFFFFFF, 0xFFFF};
+    static const uint64_t bits[5] = {
+        0xFFFFFFFFFFFFFFFF, 0xFF80800080008000, 0xFFFFFFFFFF, 0x8080FFFFFFFF, 0xFFFF,
+    };
     send_five(esc, bits);
 }
 
@@ -260,7 +265,7 @@ int main(int argc, char **argv)
             if (got <= 0) {
                 if (got < 0 && errno == EAGAIN)
                     continue;
-                return 0; /* the line has gone */
+                return 0; /* the other end of the line was closed */
             }
             e->held += got;
             find(e, now);

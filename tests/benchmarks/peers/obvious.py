@@ -1,9 +1,11 @@
-"""The obvious program: a thread a port, pyserial, zlib, struct, cantools and python-can. What a competent person writes at first.
+"""The obvious program: the first version that a competent programmer would write.
 
     python obvious.py DBC CHANNEL PORT...
 
-Each live frame becomes the five messages of the DBC (ESC n has ids n-1 higher). A value that does not fit is sent as Error, without live
-frames for 250 ms everything is NotAvailable, as is the BEC current of a JIVEPro.
+It has a thread for each port, and uses pyserial, zlib, struct, cantools and python-can. For each
+UART frame of live data it sends the five messages of the DBC. The ids of ESC n are higher by n-1. A
+value that does not fit is sent as Error. After 250 ms without UART frames of live data, all values
+are sent as NotAvailable. The BEC current of a JIVEPro is always NotAvailable.
 """
 
 import contextlib
@@ -26,7 +28,7 @@ SIGNALS = (
     *("OperatingErrors", "OperatingStateRaw", "Timing"),
 )
 STEPS = (1, 100, 10, 10, 10, 1, 1000, 1000, 1, 1, 1, 1, 1, 1, 1, 1)
-"""To a unit."""
+"""Steps of a unit."""
 LENGTHS = {b"KODL": (38, 40), b"KODI": (41, 44)}
 TIMEOUT = 0.25
 INFO_TIMEOUT = 10.0
@@ -34,7 +36,7 @@ JIVEPRO = 3
 
 
 def values_of(frame: bytes, supplied: bool) -> dict[str, Any]:
-    """The signals of a live frame; ``supplied``: its BEC current is one."""
+    """Return the signals of a frame. ``supplied`` is True if the ESC measures its BEC current."""
     found = zip(SIGNALS, STEPS, LIVE.unpack_from(frame), strict=True)
     values: dict[str, Any] = {name: value / steps for name, steps, value in found}
     if not supplied:
@@ -43,7 +45,7 @@ def values_of(frame: bytes, supplied: bool) -> dict[str, Any]:
 
 
 def can_frame(message: Any, values: dict[str, Any], index: int) -> can.Message:
-    """A message of ESC number ``index``; what a signal has no room for is Error."""
+    """Return a message of ESC number ``index``. Values that do not fit are Error."""
     own = {signal.name: values[signal.name] for signal in message.signals}
     for signal in message.signals:
         value = own[signal.name]
@@ -54,7 +56,7 @@ def can_frame(message: Any, values: dict[str, Any], index: int) -> can.Message:
 
 
 class Esc:
-    """One ESC: its port, what was received and is not decoded yet, its messages."""
+    """One ESC: its port, received bytes that are not decoded yet, and its messages."""
 
     def __init__(self, index: int, port: Any, *shared: Any) -> None:
         self.index = index
@@ -69,13 +71,13 @@ class Esc:
         self.is_up = False
 
     def run(self) -> None:
-        """Serve the port for ever."""
+        """Read the port without end."""
         self.send(dict.fromkeys(SIGNALS, "NotAvailable"))
         while True:
             self.step()
 
     def step(self) -> None:
-        """Wait for bytes and decode what there is."""
+        """Wait for bytes and decode all complete frames."""
         data = self.port.read(self.port.in_waiting or 1)
         now = time.monotonic()
         if self.is_up and now - self.live_time > TIMEOUT:
@@ -89,7 +91,7 @@ class Esc:
             self.find_frames()
 
     def find_frames(self) -> None:
-        """Take the whole frames out of the buffer."""
+        """Remove the complete frames from the buffer and handle them."""
         while True:
             start = self.buffer.find(b"KOD")
             if start < 0:
@@ -114,7 +116,7 @@ class Esc:
                 self.buffer = self.buffer[1:]
 
     def handle(self, frame: bytes, layout: int) -> None:
-        """A frame whose CRC is right."""
+        """Handle a frame whose CRC is right."""
         if layout != self.layout:
             self.layout = layout
             self.device = self.last_device = None
@@ -135,13 +137,13 @@ class Esc:
         """Encode and send all messages."""
         for message in self.database.messages:
             frame = can_frame(message, values, self.index)
-            # the bus is full: the next one is newer anyway
+            # if the bus is full, the next frame has newer values
             with self.lock, contextlib.suppress(can.CanOperationError):
                 self.bus.send(frame)
 
 
 def main(arguments: list[str]) -> None:
-    """A thread a port."""
+    """Start a thread for each port."""
     dbc, channel, *ports = arguments
     database = cantools.database.load_file(dbc)
     bus = can.Bus(interface="socketcan", channel=channel)
