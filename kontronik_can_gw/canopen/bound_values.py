@@ -40,14 +40,19 @@ def bits_of(variable: Variable) -> int:
     return TYPE_BITS.get(variable.entry.data_type, 0)
 
 
-def bind_values(dictionary: Dictionary, esc: EscTelemetry, gateway: GatewayStatus) -> None:
+def bind_values(
+    dictionary: Dictionary,
+    esc: EscTelemetry,
+    gateway: GatewayStatus,
+) -> None:
     """Bind all objects that show a value of the ESC or the gateway."""
     source = (esc, gateway)
     for (index, sub), bound in bindings_of(esc.protocol).items():
         variable = dictionary.get(index, sub)
         if variable is not None:
             variable.bound = bound
-            variable.read = partial(_read, bound, variable.entry.data_type, dictionary, source)
+            data_type = variable.entry.data_type
+            variable.read = partial(_read, bound, data_type, dictionary, source)
 
 
 def _read(
@@ -116,10 +121,20 @@ def _stored(variable: Variable) -> EscValue:
         except SdoAbort:
             return None
 
-    return EscValue(variable.entry.name, "", Group.GATEWAY, Kind.GATEWAY, read=read)
+    return EscValue(
+        variable.entry.name,
+        "",
+        Group.GATEWAY,
+        Kind.GATEWAY,
+        read=read,
+    )
 
 
-def message_plan(name: str, cob_id: int, mapped: Sequence[Variable]) -> MessagePlan:
+def message_plan(
+    name: str,
+    cob_id: int,
+    mapped: Sequence[Variable],
+) -> MessagePlan:
     """Return the plan of a PDO, which holds one object after the other, lowest bit first."""
     signals = []
     at_bit = 0

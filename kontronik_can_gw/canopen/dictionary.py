@@ -156,6 +156,10 @@ def signature(word: bytes) -> Check:
     return check
 
 
+def _ignore(_variable: Variable, _changed: bool, _now: int) -> None:
+    """Do nothing after a download."""
+
+
 class Dictionary:
     """All variables of one node.
 
@@ -163,11 +167,14 @@ class Dictionary:
     """
 
     def __init__(self, eds: Eds) -> None:
-        self.variables = {key(entry.index, entry.sub): Variable(entry) for entry in eds.entries}
+        self.variables: dict[int, Variable] = {}
+        """All variables by ``key``."""
+        for entry in eds.entries:
+            self.variables[key(entry.index, entry.sub)] = Variable(entry)
         self._indices = frozenset(entry.index for entry in eds.entries)
         self.read_only = False
         """True if all writes over the bus are refused."""
-        self.written: Callable[[Variable, bool, int], None] = lambda _variable, _changed, _now: None
+        self.written: Callable[[Variable, bool, int], None] = _ignore
         """Called after each download with the variable, True if its value changed, and the time."""
 
     def get(self, index: int, sub: int = 0) -> Variable | None:
@@ -194,7 +201,12 @@ class Dictionary:
             variable.check = check
             variable.written = written
 
-    def number(self, index: int, sub: int = 0, otherwise: int | None = None) -> int:
+    def number(
+        self,
+        index: int,
+        sub: int = 0,
+        otherwise: int | None = None,
+    ) -> int:
         """Return the whole number that a variable stores.
 
         Without such a variable it is ``otherwise``, or the shipped EDS's default if that is None.
@@ -249,7 +261,13 @@ class Dictionary:
             raise SdoAbort(Abort.TOO_SHORT)
         return variable.max_size
 
-    def download(self, index: int, sub: int, data: bytes, now: int) -> bool:
+    def download(
+        self,
+        index: int,
+        sub: int,
+        data: bytes,
+        now: int,
+    ) -> bool:
         """Write a value. Returns False if it is confirmed later. SdoAbort if it is refused."""
         self.check_download(index, sub, len(data))
         variable = self.find(index, sub)
@@ -266,7 +284,12 @@ class Dictionary:
 
     # --- power-on and storage
 
-    def reset(self, profile: range, node_id: int, stored: Mapping[int, bytes]) -> list[int]:
+    def reset(
+        self,
+        profile: range,
+        node_id: int,
+        stored: Mapping[int, bytes],
+    ) -> list[int]:
         """Set the variables of these indices to their stored values, or else to their defaults.
 
         Returns the keys of stored values that were rejected because they do not fit this EDS.

@@ -60,7 +60,11 @@ _TYPES = {
 TYPE_NAMES = {code: name for code, (name, _) in _TYPES.items()}
 SIGNED = frozenset(code for code, (_, form) in _TYPES.items() if form and form in "bhiq")
 FLOATS = frozenset({REAL32, REAL64})
-CODECS = {code: struct.Struct(f"<{form}") for code, (_, form) in _TYPES.items() if form}
+CODECS = {
+    code: struct.Struct(f"<{form}")  # little endian
+    for code, (_, form) in _TYPES.items()
+    if form
+}
 """Codecs of the number types."""
 TYPE_BITS = {code: 8 * codec.size for code, codec in CODECS.items()} | {BOOLEAN: 1}
 """Numbers of bits of the number types."""
@@ -143,7 +147,11 @@ def read_sections(data: bytes, problems: list[str]) -> dict[str, Section]:
     return sections
 
 
-def _read_key(section: Section, text: str, has_heading: bool) -> Iterator[str]:
+def _read_key(
+    section: Section,
+    text: str,
+    has_heading: bool,
+) -> Iterator[str]:
     """Add a line ``key=value`` to its section, and yield its mistakes."""
     key, equals, value = (part.strip() for part in text.partition("="))
     if not value.isascii():
@@ -232,11 +240,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Eds:
-    """A parsed EDS. ``data`` is the unchanged file. ``entries`` are ordered by index and sub-index."""
+    """A parsed EDS. ``data`` is the unchanged file."""
 
     data: bytes
     name: str
     entries: tuple[Entry, ...]
+    """All entries, ordered by index and sub-index."""
     object_names: dict[int, str]
 
 
@@ -274,7 +283,10 @@ def load(data: bytes, name: str) -> Eds:
 
 
 def _cut(text: str) -> str:
-    """Return a mistake without its middle if it is long. Its ends hold the reason and the remedy."""
+    """Return a mistake without its middle if it is long.
+
+    The reason and the remedy are at its ends.
+    """
     if len(text) <= _MAX_LENGTH:
         return text
     half = _MAX_LENGTH // 2
@@ -373,7 +385,13 @@ def _limit(section: Section, key: str, data_type: int) -> int | None:
     return _fitting(section, key, text, data_type)
 
 
-def _fitting(section: Section, key: str, text: str, data_type: int, room: int = 0) -> int:
+def _fitting(
+    section: Section,
+    key: str,
+    text: str,
+    data_type: int,
+    room: int = 0,
+) -> int:
     """Return a whole number that fits its type with ``room`` above it.
 
     Signed numbers may be hexadecimal in two's complement. ValueError for a mistake.
@@ -391,7 +409,10 @@ def _fitting(section: Section, key: str, text: str, data_type: int, room: int = 
     return number
 
 
-def _default(section: Section, data_type: int) -> tuple[int | float | bytes | None, bool]:
+def _default(
+    section: Section,
+    data_type: int,
+) -> tuple[int | float | bytes | None, bool]:
     """Return the default, and True if the node-ID must be added to it."""
     text = section.get("DefaultValue")
     if not text:
@@ -410,7 +431,8 @@ def _default(section: Section, data_type: int) -> tuple[int | float | bytes | No
     match = _NODE_ID.match(text.replace(" ", ""))
     if match:
         value = match["after"] or match["before"] or "0"
-        return _fitting(section, "DefaultValue", value, data_type, room=127), True
+        default = _fitting(section, "DefaultValue", value, data_type, room=127)
+        return default, True
     return _fitting(section, "DefaultValue", text, data_type), False
 
 

@@ -1,4 +1,4 @@
-"""Decoding of EDS texts, including those of Windows editors."""
+"""Decoding of EDS texts, which Windows editors may have written."""
 
 import codecs
 import re

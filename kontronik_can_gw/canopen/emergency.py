@@ -276,7 +276,8 @@ class Emergencies:
             self._unreported[condition] = None
 
     def _note(self, condition: Condition) -> None:
-        self.history.appendleft(condition.detail << 24 | condition.source << 16 | condition.code)
+        entry = condition.detail << 24 | condition.source << 16 | condition.code
+        self.history.appendleft(entry)
 
     def _end(self, now: int) -> None:
         """Report 0000h if errors were reported or are pending, and all have ended."""

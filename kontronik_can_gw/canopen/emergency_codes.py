@@ -44,7 +44,13 @@ class GatewayError(Enum):
     remedy: str
     """Advice for the user."""
 
-    def __new__(cls, code: int, detail: int, meaning: str, remedy: str) -> Self:
+    def __new__(
+        cls,
+        code: int,
+        detail: int,
+        meaning: str,
+        remedy: str,
+    ) -> Self:
         member = object.__new__(cls)
         member._value_ = code, detail
         member.meaning = meaning
@@ -135,8 +141,8 @@ class BitCodes:
         register = 0
         for bit in _bits_of(summary_free & self._error_bits | bits):
             register |= register_of(self.code(bit))
-        conditions = tuple(Condition(self.code(bit), bit, 0) for bit in _bits_of(bits))
-        return conditions, register
+        conditions = [Condition(self.code(bit), bit, 0) for bit in _bits_of(bits)]
+        return tuple(conditions), register
 
 
 def _mask_of(bits: Sequence[ErrorBit], severity: Severity) -> int:

@@ -256,7 +256,13 @@ class LssSlave:
             if was_configuring:
                 self._host.lss_left_configuration(now)
 
-    def _completes(self, services: range, service: int, expected: int, is_match: bool) -> bool:
+    def _completes(
+        self,
+        services: range,
+        service: int,
+        expected: int,
+        is_match: bool,
+    ) -> bool:
         """Return True if this frame completes a selection or identification of this node.
 
         ``is_match`` is True if this frame's part matches the node.
@@ -277,7 +283,13 @@ class LssSlave:
         is_lowest = service in (_IDENTIFY[2], _IDENTIFY[4])
         return own >= number if is_lowest else own <= number
 
-    def _fastscan(self, number: int, bit_checked: int, sub: int, following: int) -> None:
+    def _fastscan(
+        self,
+        number: int,
+        bit_checked: int,
+        sub: int,
+        following: int,
+    ) -> None:
         """Serve 51h, IDNumber (4), BitChecked 0..31 or 80h, LSSSub 0..3, LSSNext 0..3."""
         if sub > 3 or following > 3:
             return

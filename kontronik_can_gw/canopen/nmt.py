@@ -184,15 +184,23 @@ class Consumer:
 
     @property
     def due(self) -> int:
+        """Earliest time at which ``advance`` acts."""
         if not self._watched:
             return NEVER
-        return max(self._judged_from, min(watched.due for watched in self._watched.values()))
+        first_due = min(watched.due for watched in self._watched.values())
+        return max(self._judged_from, first_due)
 
     def held_up(self, now: int) -> None:
-        """Note that the process was held up until ``now``, so that heartbeats may still be unread."""
+        """Note that the process was held up until ``now``, so heartbeats may still be unread."""
         self._judged_from = now + _CATCHING_UP_NS
 
-    def receive(self, node_id: int, data: bytes, now: int, at: int) -> None:
+    def receive(
+        self,
+        node_id: int,
+        data: bytes,
+        now: int,
+        at: int,
+    ) -> None:
         """Note a heartbeat or boot-up message that arrived ``at``."""
         watched = self._watched.get(node_id)
         if len(data) != 1 or watched is None:
@@ -244,7 +252,10 @@ class Consumer:
         if value >> 24:
             raise SdoAbort(Abort.VALUE)  # reserved bits
         watch = _watch_of(value)
-        if watch is not None and watch[0] in dict(self._entries(own)):
+        if watch is None:
+            return
+        node_id, _ = watch
+        if node_id in dict(self._entries(own)):
             raise SdoAbort(Abort.INCOMPATIBLE)
 
     def _entries(self, skipped: Variable | None = None) -> Iterator[tuple[int, int]]:

@@ -65,7 +65,13 @@ class Bound:
         """Steps of the object per step of the value."""
         return self.steps / self.source.per_unit
 
-    def read(self, esc: EscTelemetry, gateway: GatewayStatus, now: int, high: int) -> int | None:
+    def read(
+        self,
+        esc: EscTelemetry,
+        gateway: GatewayStatus,
+        now: int,
+        high: int,
+    ) -> int | None:
         """Return the number that the object shows now. None if the value is not available.
 
         A counter restarts at 0 after ``high``.
@@ -78,14 +84,23 @@ class Bound:
         value = steps_of(self.source, esc, esc.last_live)
         return self._shown(esc, value, high)
 
-    def _shown(self, esc: EscTelemetry, value: int | None, high: int) -> int | None:
+    def _shown(
+        self,
+        esc: EscTelemetry,
+        value: int | None,
+        high: int,
+    ) -> int | None:
         shown = scaled(self.source, esc, value, self.slope)
         if shown is not None and self.source.rolls:
             return shown % (high + 1)
         return shown
 
 
-def _counter(name: str, read: Callable[[EscTelemetry], int], pace: Group | None = None) -> Value:
+def _counter(
+    name: str,
+    read: Callable[[EscTelemetry], int],
+    pace: Group | None = None,
+) -> Value:
     """Return a counter of the link, which restarts at 0."""
     return Value(
         name,
@@ -112,10 +127,22 @@ def _age(name: str, stamp: Callable[[EscTelemetry], int | None]) -> Value:
         age_ms = max(0, now - at) // MS
         return min(age_ms, U16 - 1)
 
-    return Value(name, "ms", Group.LINK, Kind.OBJECT, read=read, low=0, high=U16)
+    return Value(
+        name,
+        "ms",
+        Group.LINK,
+        Kind.OBJECT,
+        read=read,
+        low=0,
+        high=U16,
+    )
 
 
-def link_status(esc: EscTelemetry, gateway: GatewayStatus, _now: int) -> int:
+def link_status(
+    esc: EscTelemetry,
+    gateway: GatewayStatus,
+    _now: int,
+) -> int:
     """Return 2020h:1: bits 0..5 link state, bit 6 replay, bit 7 fresh information."""
     is_replay = gateway.state is GatewayState.REPLAY
     has_info = esc.info is not None
@@ -127,10 +154,20 @@ def _kept(value: Value) -> Value:
 
     Bit 7 of the link status shows that it is not fresh.
     """
-    return replace(value, group=Group.LINK, last=True, optional=True, pace=Group.INFO)
+    return replace(
+        value,
+        group=Group.LINK,
+        last=True,
+        optional=True,
+        pace=Group.INFO,
+    )
 
 
-def _firmware(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | None:
+def _firmware(
+    esc: EscTelemetry,
+    _gateway: GatewayStatus,
+    _now: int,
+) -> int | None:
     """Return the main version times 256, plus the sub version. None if unknown."""
     main = esc.protocol.value("firmware_main", esc.last_info)
     sub = esc.protocol.value("firmware_sub", esc.last_info)
@@ -139,9 +176,26 @@ def _firmware(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | No
     return main << 8 | sub
 
 
-_FIRMWARE = Value("firmware", "", Group.INFO, Kind.OBJECT, read=_firmware, low=0, high=U16)
+_FIRMWARE = Value(
+    "firmware",
+    "",
+    Group.INFO,
+    Kind.OBJECT,
+    read=_firmware,
+    low=0,
+    high=U16,
+)
+_LINK_STATUS = Value(
+    "link_status",
+    "",
+    Group.LINK,
+    Kind.OBJECT,
+    read=link_status,
+    low=0,
+    high=U8,
+)
 _LINK_VALUES = {
-    1: Value("link_status", "", Group.LINK, Kind.OBJECT, read=link_status, low=0, high=U8),
+    1: _LINK_STATUS,
     2: _counter("live_counter", lambda esc: esc.counters.live, Group.LIVE),
     3: _age("data_age", lambda esc: esc.live_ns),
     4: _age("info_age", lambda esc: esc.last_info_ns),

@@ -152,7 +152,11 @@ class Tpdo:
         if self.valid and self._plan is not None:
             by_event = self.type in EVENT_TYPES
             settings = SlotSettings(
-                self._plan, self.cob_id, by_event, self.inhibit_ns, self.event_ns
+                plan=self._plan,
+                can_id=self.cob_id,
+                by_event=by_event,
+                inhibit_ns=self.inhibit_ns,
+                timer_ns=self.event_ns,
             )
         if not was_running:
             self.sync.begin()
@@ -184,7 +188,11 @@ class Tpdo:
 
     def _resolve_all(self, count: int) -> list[Variable]:
         number = self._dictionary.number
-        return [self.resolve(number(self.mapping_index, sub)) for sub in range(1, count + 1)]
+        mapped = []
+        for sub in range(1, count + 1):
+            mapping = number(self.mapping_index, sub)
+            mapped.append(self.resolve(mapping))
+        return mapped
 
     def resolve(self, mapping: int) -> Variable:
         """Return the object of a mapping entry (index, sub-index, bits).
@@ -296,7 +304,11 @@ def _check_type(value: int) -> None:
         raise SdoAbort(Abort.VALUE)
 
 
-def _restore_defaults(dictionary: Dictionary, indices: Sequence[int], node_id: int) -> list[int]:
+def _restore_defaults(
+    dictionary: Dictionary,
+    indices: Sequence[int],
+    node_id: int,
+) -> list[int]:
     """Set the variables of these indices to their defaults. Returns the keys of changed ones."""
     changed = []
     for number, variable in dictionary.variables.items():

@@ -19,7 +19,8 @@ The standard leaves room for these choices:
   certain. Less than the indicated size ends in 06070013h after the last segment. 06070010h ("does
   not match") is not used here, because it is always known whether data is too long or too short.
 * Both answers to a block initiate report that the server supports a CRC. A CRC is used only if the
-  client supports it too. Otherwise the field is 0 in a block upload and ignored in a block download.
+  client supports it too. Otherwise the field is 0 in a block upload, and ignored in a block
+  download.
 * An unused bit ("x") of a command is ignored, so any command with specifier 4 is an abort. An abort
   is never answered.
 """
@@ -211,7 +212,8 @@ class SdoServer:
 
     def _initiated(self, command: int, data: bytes = b"") -> bytes:
         """Return an answer with the multiplexer of the present transfer."""
-        return bytes((command,)) + self._multiplexer + data.ljust(4, b"\0")
+        head = bytes((command,)) + self._multiplexer
+        return head + data.ljust(4, b"\0")
 
     def _abort(self, code: Abort) -> None:
         """Send 80h, the multiplexer of the present transfer (0 without one) and the code."""
@@ -221,7 +223,11 @@ class SdoServer:
 
     # ---- download
 
-    def _check_download(self, data: bytes, is_size_indicated: bool) -> tuple[int | None, int]:
+    def _check_download(
+        self,
+        data: bytes,
+        is_size_indicated: bool,
+    ) -> tuple[int | None, int]:
         """Begin a download of several segments.
 
         Returns the size that the client indicates, or None, and the maximum number of bytes.
@@ -249,7 +255,9 @@ class SdoServer:
         if size is None:
             # "unspecified number of bytes" (e = 1, s = 0): the object's own length counts
             size = min(4, limit)
-        self._store(data[4 : 4 + size], self._initiated(0x60), now)
+        value = data[4 : 4 + size]
+        answer = self._initiated(0x60)
+        self._store(value, answer, now)
 
     def _initiate_block_download(self, data: bytes, now: int) -> None:
         """Serve 110x xCs0 (C: CRC, s: size indicated), multiplexer, size.
@@ -261,7 +269,8 @@ class SdoServer:
         size, limit = self._check_download(data, is_size_indicated)
         self._sub_block.note_segment(now)
         answer = self._initiated(0xA4, bytes((BLOCK_SIZE,)))
-        self._start(block_download(answer, size, limit, with_crc, self._sub_block))
+        transfer = block_download(answer, size, limit, with_crc, self._sub_block)
+        self._start(transfer)
 
     def _store(self, data: bytes, answer: bytes, now: int) -> None:
         """Pass all data to the dictionary. ``answer`` confirms the download."""
@@ -286,7 +295,8 @@ class SdoServer:
             self._send(self._initiated(0x43 | unused << 2, data))
             self.reset()
         else:
-            answer = self._initiated(0x41, len(data).to_bytes(4, "little"))
+            size = len(data).to_bytes(4, "little")
+            answer = self._initiated(0x41, size)
             self._start(segmented_upload(answer, data))
 
     def _initiate_block_upload(self, data: bytes, now: int) -> None:
@@ -303,9 +313,11 @@ class SdoServer:
         if threshold and len(value) <= threshold:
             self._start_upload(value)
         else:
-            answer = self._initiated(0xC6, len(value).to_bytes(4, "little"))
+            size = len(value).to_bytes(4, "little")
+            answer = self._initiated(0xC6, size)
             with_crc = bool(data[0] & 4)
-            self._start(block_upload(answer, value, block_size, with_crc, self._outgoing))
+            transfer = block_upload(answer, value, block_size, with_crc, self._outgoing)
+            self._start(transfer)
 
     def _send_burst(self, now: int) -> None:
         """Send the segments of a sub-block that are due."""

@@ -64,7 +64,11 @@ class SubBlock:
         return True
 
 
-def segmented_download(answer: bytes, size: int | None, limit: int) -> Transfer:
+def segmented_download(
+    answer: bytes,
+    size: int | None,
+    limit: int,
+) -> Transfer:
     """Receive segments: 000t nnnc, data (7). Answers: 001t 0000, 0 (7)."""
     data = bytearray()
     toggle = 0
@@ -85,7 +89,8 @@ def segmented_download(answer: bytes, size: int | None, limit: int) -> Transfer:
 def segmented_upload(answer: bytes, data: bytes) -> Transfer:
     """Send segments. Requests: 011t xxxx, 0 (7). Answers: 000t nnnc, data (7)."""
     toggle = 0
-    for start in range(0, max(1, len(data)), _SEGMENT_BYTES):
+    length = max(1, len(data))  # even without data, one segment is needed
+    for start in range(0, length, _SEGMENT_BYTES):
         request = yield answer
         _check_segment(request[0], 3, toggle)
         end = start + _SEGMENT_BYTES
@@ -173,12 +178,18 @@ def block_upload(
     crc = crc_hqx(data, 0) if with_crc else 0
     unused = _SEGMENT_BYTES * count - len(data)
     head = 0xC1 | unused << 2
-    request = yield bytes((head,)) + crc.to_bytes(2, "little") + bytes(5)
+    end_frame = bytes((head,)) + crc.to_bytes(2, "little") + bytes(5)
+    request = yield end_frame
     _check_block_command(request, 1)
     return None, b""
 
 
-def _segments(data: bytes, confirmed: int, in_sub_block: int, count: int) -> list[bytes]:
+def _segments(
+    data: bytes,
+    confirmed: int,
+    in_sub_block: int,
+    count: int,
+) -> list[bytes]:
     """Return the segments of a sub-block that begins after ``confirmed`` of ``count`` segments."""
     segments = []
     for number in range(1, in_sub_block + 1):

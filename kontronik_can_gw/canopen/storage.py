@@ -142,7 +142,8 @@ def _is_node_id(value: object) -> bool:
 
 
 def _line(content: Mapping[str, Any]) -> bytes:
-    return json.dumps(content, separators=(",", ":")).encode("ascii") + b"\n"
+    text = json.dumps(content, separators=(",", ":"))
+    return text.encode("ascii") + b"\n"
 
 
 def _texts(values: Mapping[int, bytes], indices: range) -> dict[str, str]:
@@ -208,15 +209,17 @@ class Parameters:
 
     def reset_application(self, node_id: int) -> None:
         """Set 2000h..FFFFh to their power-on values."""
-        self.rejected = self._dictionary.reset(APPLICATION, node_id, self._stored.application)
+        stored = self._stored.application
+        self.rejected = self._dictionary.reset(APPLICATION, node_id, stored)
 
     def reset_communication(self, node_id: int) -> None:
         """Set 1000h..1FFFh to their power-on values."""
         self._node_id = node_id
-        self.rejected += self._dictionary.reset(COMMUNICATION, node_id, self._stored.communication)
+        stored = self._stored.communication
+        self.rejected += self._dictionary.reset(COMMUNICATION, node_id, stored)
 
     def reject_what_breaks_rules(self) -> None:
-        """Replace stored communication parameters by the defaults if a download would be refused."""
+        """Replace stored communication parameters that a download would refuse by the defaults."""
         for number in self._stored.communication:
             variable = self._dictionary.variables.get(number)
             if variable is None or variable.check is None or number >> 8 not in CHECKED:
@@ -291,8 +294,8 @@ class Parameters:
     def _restore(self, part: int, _now: int) -> bool:
         """Serve 1011h: use defaults after the next reset.
 
-        A node-ID that LSS stored is kept. LSS removes it. Returns False, because the SDO server must
-        wait for the result.
+        A node-ID that LSS stored is kept. LSS removes it. Returns False, because the SDO server
+        must wait for the result.
         """
         stored = self._wanted
         if part in _ALL_OR_COMMUNICATION:
