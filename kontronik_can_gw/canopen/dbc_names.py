@@ -1,4 +1,4 @@
-"""Names in the PDO DBC."""
+"""Names of messages, signals and values in the PDO DBC."""
 
 import re
 from collections.abc import Sequence
@@ -9,19 +9,19 @@ from kontronik_can_gw.esc.decoder import ErrorBit
 
 
 class Names:
-    """Makes names that are unique in the file, even if case is ignored, and not too long."""
+    """Names that are unique in a file, even without regard to case, and short enough for tools."""
 
     def __init__(self) -> None:
         self._taken: set[str] = set()
 
-    def take(self, prefix: str, stem: str, end: str = "") -> str:
-        """Return a new name of ``prefix``, ``stem`` and ``end``.
+    def make_unique(self, prefix: str, stem: str, end: str = "") -> str:
+        """Return ``prefix`` + ``stem`` + ``end``, and note the name as taken.
 
-        The stem is shortened if necessary. A number is added to it if the name is already used.
+        The stem is cut to fit, and gets a number if the name is taken already.
         """
         number = 1
         while True:
-            tail = end if number == 1 else f"{number}{end}"
+            tail = f"{number}{end}" if number > 1 else end
             room = MAX_NAME - len(prefix) - len(tail)
             name = prefix + stem[:room] + tail
             if name.lower() not in self._taken:
@@ -31,30 +31,31 @@ class Names:
 
 
 def pascal_case(text: str) -> str:
-    """Return a name in the spelling of DBC files.
+    """Return a name of any spelling in Pascal case, as DBC files have it.
 
-    For example, ``bec_voltage``, ``BEC voltage`` and ``BecVoltage`` become ``BecVoltage``.
+    ``bec_voltage``, ``BEC voltage`` and ``BecVoltage`` become ``BecVoltage``.
     """
-    words = (
-        re.sub("[A-Z]+(?=[A-Z][a-z]|[^a-z]*$)", _capitalized, word)
-        for word in re.split("[^A-Za-z0-9]+", text)
-    )
-    return "".join(word[:1].upper() + word[1:] for word in words)
+    parts = []
+    for word in re.split("[^A-Za-z0-9]+", text):
+        capitalized = re.sub("[A-Z]+(?=[A-Z][a-z]|[^a-z]*$)", _capitalized, word)
+        parts.append(capitalized[:1].upper() + capitalized[1:])
+    return "".join(parts)
 
 
 def emergency_names(bits: Sequence[ErrorBit]) -> dict[int, str]:
-    """Return the names of all emergency codes that a node can send. 0 is NoError."""
-    named = {int(bit): pascal_case(bit.name) for bit in bits}
+    """Return the name of every emergency code that a node can send. 0 is NoError."""
+    bit_names = {int(bit): pascal_case(bit.name) for bit in bits}
     codes = BitCodes(bits)
-    found = {0: "NoError"}
+    names = {0: "NoError"}
     for bit in range(32):
-        found[codes.code(bit)] = named.get(bit, f"Bit{bit}")
+        names[codes.code(bit)] = bit_names.get(bit, f"Bit{bit}")
     for error in GatewayError:
         code, _ = error.value
-        found[code] = pascal_case(error.name)
-    shared_code, _ = GatewayError.TELEMETRY_LOST.value
-    found[shared_code] = "TelemetryFault"  # the name for all errors with this code
-    return found
+        names[code] = pascal_case(error.name)
+    # several errors of the gateway share this code
+    code, _ = GatewayError.TELEMETRY_LOST.value
+    names[code] = "TelemetryFault"
+    return names
 
 
 def _capitalized(match: re.Match[str]) -> str:

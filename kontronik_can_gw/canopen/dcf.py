@@ -1,4 +1,4 @@
-"""Makes texts from an EDS: a shorter EDS, and the DCF of one node (CiA 306, clause 5)."""
+"""Texts made from an EDS: an EDS without some objects, and the DCF of a node (CiA 306, 5)."""
 
 import re
 from collections.abc import Container, Mapping
@@ -25,23 +25,28 @@ _OF_OBJECT = re.compile(r"([0-9a-f]{4})(sub[0-9a-f]+|denotation|objectlinks)?$",
 
 
 def without(eds_data: bytes, indices: Container[int]) -> bytes:
-    """Return the EDS without these objects. The remaining entries of its lists are renumbered."""
-    sections = {}
+    """Return the EDS without the objects of these indices. Its lists are numbered again."""
+    sections: dict[str, Section] = {}
     for name, section in read_sections(eds_data, []).items():
         match = _OF_OBJECT.match(name)
         if match is None or int(match[1], 16) not in indices:
             sections[name] = section
     for name in _LISTS:
-        if name not in sections:
-            continue
-        section = sections[name]
-        listed = [value for key, (_, value) in section.keys.items() if key.isdigit()]
-        kept = [value for value in listed if integer(value) not in indices]
-        section.keys = {}
-        section.set("SupportedObjects", len(kept))
-        for number, value in enumerate(kept, 1):
-            section.set(str(number), value)
-    return text_of(sections).encode("ascii", "replace")
+        if name in sections:
+            _remove_from_list(sections[name], indices)
+    text = text_of(sections)
+    return text.encode("ascii", "replace")
+
+
+def _remove_from_list(section: Section, indices: Container[int]) -> None:
+    left = []
+    for key, (_, value) in section.keys.items():
+        if key.isdigit() and integer(value) not in indices:
+            left.append(value)
+    section.keys = {}
+    section.set("SupportedObjects", len(left))
+    for number, value in enumerate(left, 1):
+        section.set(str(number), value)
 
 
 def dcf(
@@ -52,49 +57,67 @@ def dcf(
     node_name: str,
     file_name: str,
 ) -> str:
-    """Return the EDS as the DCF of one node (CiA 306, clause 5).
+    """Return the DCF of one node, made from its EDS (CiA 306, clause 5).
 
-    It has a ParameterValue for each of ``values``, and the section [DeviceComissioning]. The node's
-    values already include the node-ID. ``bitrate`` is in bit/s. ``file_name`` is the name of the
-    DCF, and LastEDS has the name of the EDS. Lines end in CR LF.
+    The DCF has a ParameterValue for each of ``values``, and [DeviceComissioning]. Lines end in
+    CR LF.
 
-    Domains are left out, because a DCF has file names for them. Real numbers are written as
-    decimals, which the package canopen can read. Raises KeyError for a value without an entry, and
-    UserError for a text that an INI file cannot contain.
+    ``bitrate`` is in bit/s. ``file_name`` is the name of the DCF. LastEDS holds the name of the
+    EDS. Values are as in the node, with the node-ID added. Domains are left out, because a DCF
+    refers to files for them. Real numbers are written as decimals, which the canopen package reads.
+
+    KeyError for a value without an entry. UserError for a text that an INI file cannot hold.
     """
     entries = {(entry.index, entry.sub): entry for entry in eds.entries}
-    texts = {
-        at: _value_text(eds.name, entries[at], value)
-        for at, value in values.items()
-        if entries[at].data_type != DOMAIN_TYPE
-    }
+    texts: dict[tuple[int, int], str] = {}
+    for place, value in values.items():
+        if entries[place].data_type != DOMAIN_TYPE:
+            texts[place] = _value_text(eds.name, entries[place], value)
     sections = read_sections(eds.data, [])
     for name, section in sections.items():
         section.keys.pop("parametervalue", None)
         match = OBJECT.match(name)
         if match is not None:
-            at = (int(match[1], 16), int(match[2] or "0", 16))
-            if at in texts:
-                section.set("ParameterValue", texts[at])
+            index = int(match[1], 16)
+            sub = int(match[2] or "0", 16)
+            text = texts.get((index, sub))
+            if text is not None:
+                section.set("ParameterValue", text)
     file_info = sections.get("fileinfo")
     if file_info is not None:
         eds_name = PurePath(eds.name).name
+        ascii_name = eds_name.encode("ascii", "replace").decode("ascii")
         file_info.set("FileName", file_name)
-        file_info.set("LastEDS", eds_name.encode("ascii", "replace").decode("ascii"))
-    node = Section("DeviceComissioning")  # this is the spelling of CiA 306
-    sections["devicecomissioning"] = node
+        file_info.set("LastEDS", ascii_name)
+    sections["devicecomissioning"] = _device_commissioning(
+        node_id,
+        bitrate,
+        node_name,
+        values.get((0x1018, 4)),
+    )
+    return text_of(sections)
+
+
+def _device_commissioning(
+    node_id: int,
+    bitrate: int,
+    node_name: str,
+    serial: float | bytes | None,
+) -> Section:
+    node = Section("DeviceComissioning")  # the spelling of CiA 306
     node.set("NodeID", f"0x{node_id:02X}")
     node.set("NodeName", node_name)
     node.set("Baudrate", bitrate // 1000)
     node.set("NetNumber", 0)
     node.set("CANopenManager", 0)
-    serial = values.get((0x1018, 4))
-    if isinstance(serial, int) and serial != 0:  # 0: unknown, so an LSS master cannot search for it
+    # 0 means unknown, and an LSS master could not search for it
+    if isinstance(serial, int) and serial:
         node.set("LSS_SerialNumber", f"0x{serial:08X}")
-    return text_of(sections)
+    return node
 
 
 def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
+    """Return the text of a ParameterValue. UserError if an INI file cannot hold it."""
     if isinstance(value, float):
         return repr(value)
     if isinstance(value, int):
@@ -104,7 +127,8 @@ def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
         return f"0x{value:0{digits}X}"
     if entry.data_type == OCTET_STRING:
         return value.hex()
-    text = value.decode("utf-16-le" if entry.data_type == UNICODE_STRING else "latin-1")
+    coding = "utf-16-le" if entry.data_type == UNICODE_STRING else "latin-1"
+    text = value.decode(coding)
     is_plain = text.isascii() and text.isprintable()
     if not is_plain or bare(f"={text}")[1:].strip() != text:
         problem = f"the text {text!r} of {entry.name} cannot stand in a DCF."
