@@ -1,4 +1,4 @@
-"""Checks at the start that a node can be built from an EDS, and finds all mistakes by object."""
+"""The checks at start that a node can be built from an EDS. Mistakes name the object."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
@@ -29,11 +29,11 @@ Mistake = tuple[Entry, str]
 _PDOS = range(COMMUNICATION, COMMUNICATION + MAX_TPDOS)
 _MAPPINGS = range(MAPPING, MAPPING + MAX_TPDOS)
 _PLAIN = frozenset({0x1000, 0x1008, 0x1009})
-"""Objects that no service uses."""
+"""Objects that are not bound to a service."""
 _FREE = frozenset({0x1022, at.UNITS})
-"""Unused objects that may have any type, because copies of CiA's table differ."""
+"""Objects without a service that may have any type, because copies of CiA's table differ."""
 _LISTS = {0x1003: 0xFE, 0x1016: 0x7F, 0x1029: 0xFE, MAPPING: 0x40}
-"""Lists that may be longer than in the shipped EDS, and their greatest possible sub-indices."""
+"""Lists that may be longer than in the shipped EDS, with their last possible sub-index."""
 _SERVER = {(0x1200, 1): SDO_REQUEST, (0x1200, 2): SDO_ANSWER}
 _MANDATORY = {(0x1000, 0), (0x1001, 0), (0x1018, 1)}
 
@@ -43,31 +43,34 @@ def check_eds(
 ) -> None:
     """Check that nodes with these node-IDs, for these ESCs, can be built from an EDS.
 
-    Raises UserError with every mistake. Objects of services must be as in the shipped EDS. Below
-    2000h they must have the same type and access, otherwise a type of the same kind.
+    Objects of services must be like those of the shipped EDS: below 2000h of the same type and
+    access, and from 2000h on of the same kind. UserError with all mistakes.
     """
     entries = {(entry.index, entry.sub): entry for entry in eds.entries}
-    found = [*_objects(entries, shipped), *_settings(entries, escs)]
-    problems = [f"{entry.place} {entry.name}: {mistake}" for entry, mistake in found]
+    mistakes = [*_objects(entries, shipped), *_settings(entries, escs)]
+    problems = [f"{entry.place} {entry.name}: {problem}" for entry, problem in mistakes]
     problems += _missing(entries)
     if not problems:
-        numbers = list(node_ids) or [1]  # if all nodes wait for LSS, any node-ID is possible
+        # if all nodes wait for LSS, any node-ID is possible, and 1 is checked
+        numbers = list(node_ids) or [1]
         for node_id in numbers:
             problems += _defaults(eds, escs[0], node_id)
         problems += _shared_ids(Dictionary(eds), numbers)
     if problems:
-        raise UserError(*(f"{eds.name}: {what}" for what in dict.fromkeys(problems)))
+        without_duplicates = dict.fromkeys(problems)
+        raise UserError(*(f"{eds.name}: {problem}" for problem in without_duplicates))
 
 
 def _missing(entries: Mapping[Place, Entry]) -> Iterator[str]:
-    """Yield the missing mandatory objects.
+    """Yield the mandatory objects that are missing.
 
-    The second object of each PDO, and sub-index 0 of each object, are mandatory, too.
+    Each object needs its sub-index 0, and the two objects of a PDO need each other.
     """
     needed = set(_MANDATORY)
     for index in {index for index, _ in entries}:
         if index in _PDOS:
-            needed |= {(index, 1), (index, 2), (index - COMMUNICATION + MAPPING, 0)}
+            mapping = index - COMMUNICATION + MAPPING
+            needed |= {(index, 1), (index, 2), (mapping, 0)}
         elif index in _MAPPINGS:
             needed.add((index - MAPPING + COMMUNICATION, 0))
         needed.add((index, 0))
@@ -76,51 +79,58 @@ def _missing(entries: Mapping[Place, Entry]) -> Iterator[str]:
 
 
 def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
-    """Yield the mistakes in types and access of objects that telemetry and services use."""
+    """Yield mistakes in type, access and default of objects that telemetry and services use."""
     known = {(entry.index, entry.sub): entry for entry in shipped.entries}
     highest = dict(entries.keys())  # the last sub-index of each index
     for (index, sub), entry in entries.items():
         reference = _reference(known, index, sub)
         if reference is not None:
-            for mistake in _unlike(entry, reference):
-                yield entry, mistake
+            for problem in _unlike(entry, reference):
+                yield entry, problem
         elif index < 0x2000:
             yield entry, "this node has no such service. Remove the object."
         first = _SERVER.get((index, sub))
         if first is not None and not (entry.default == first and entry.relative):
             yield entry, f"must be $NODEID+0x{first:X}: the SDO server has no other."
-        # Sub-index 0 of these is a count that changes: of errors, or of mapped objects.
+        # sub-index 0 of the history and of mappings is a number that changes
         is_count = index == 0x1003 or index in _MAPPINGS
         last = highest[index]
-        if sub == 0 and last and entry.default != last and not is_count:
+        is_wrong = last and entry.default != last
+        if not sub and is_wrong and not is_count:
             yield entry, f"must be 0x{last:02X}, the highest sub-index."
 
 
 def _reference(known: Mapping[Place, Entry], index: int, sub: int) -> Entry | None:
-    """Return the entry of the shipped EDS that an entry must resemble, or None."""
+    """Return the entry of the shipped EDS that an entry must be like, or None.
+
+    All PDOs are like the first one. Members that the shipped EDS lacks are like sub-index 1.
+    """
     if index in _PDOS:
         index = COMMUNICATION
     elif index in _MAPPINGS:
         index = MAPPING
     reference = known.get((index, sub))
-    last = 0xFE if index >= 0x2000 else _LISTS.get(index, 0)
-    if reference is None and 0 < sub <= last:
-        reference = known.get((index, 1))
+    if reference is None:
+        last_sub = 0xFE if index >= 0x2000 else _LISTS.get(index, 0)
+        if 0 < sub <= last_sub:
+            reference = known.get((index, 1))
     return reference
 
 
 def _unlike(entry: Entry, shipped: Entry) -> Iterator[str]:
-    """Yield the properties that make an object useless for its service."""
+    """Yield the differences that make an object useless for its service."""
     index = entry.index
     kind = entry.data_type
     wanted = shipped.data_type
     if index in _FREE:
         return
-    if (index < 0x2000 or wanted not in WHOLE) and kind != wanted:
+    needs_same_type = index < 0x2000 or wanted not in WHOLE
+    is_storage = index >= 0x2000 and (index, entry.sub) not in BINDINGS
+    if needs_same_type and kind != wanted:
         yield f"must be of type {TYPE_NAMES[wanted]}, 0x{wanted:04X}."
     elif wanted in WHOLE and kind not in WHOLE:
         yield "must be of a whole-number type."
-    elif wanted in WHOLE and index >= 0x2000 and (index, entry.sub) not in BINDINGS:
+    elif wanted in WHOLE and is_storage:
         bits = TYPE_BITS[wanted] if index != at.SETTINGS else 8
         if kind in SIGNED or TYPE_BITS[kind] < bits:
             yield f"must be of an unsigned type of {bits} bits or more."
@@ -128,8 +138,11 @@ def _unlike(entry: Entry, shipped: Entry) -> Iterator[str]:
         yield "is shown by the node, so it must be read only (AccessType=ro or const)."
 
 
-def _settings(entries: Mapping[Place, Entry], escs: Sequence[EscSettings]) -> Iterator[Mistake]:
-    """Settings of the configuration that their objects cannot hold."""
+def _settings(
+    entries: Mapping[Place, Entry],
+    escs: Sequence[EscSettings],
+) -> Iterator[Mistake]:
+    """Yield configured settings that do not fit their objects."""
     for esc in escs:
         for sub, value in configured_settings(esc).items():
             entry = entries.get((at.SETTINGS, sub))
@@ -139,36 +152,37 @@ def _settings(entries: Mapping[Place, Entry], escs: Sequence[EscSettings]) -> It
             low = low if entry.low is None else entry.low
             high = high if entry.high is None else entry.high
             if not low <= value <= high:
-                what = f"cannot hold {value}, which the configuration says of {esc.name}."
-                yield entry, f"{what} Use a larger DataType or limit."
+                problem = f"cannot hold {value}, which the configuration says of {esc.name}."
+                yield entry, f"{problem} Use a larger DataType or limit."
 
 
 def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
-    """Defaults that a download would be refused: of single services, then of the PDOs."""
+    """Yield defaults that would be refused in a download: of single services, then of PDOs."""
     setup = NodeSetup(eds, NodeSettings(node_id), Stored())
     node = nodes_alone([setup], [settings], {}).nodes[0]
     dictionary = node.dictionary
     dictionary.reset(COMMUNICATION_PROFILE, node_id, {})
     for variable in dictionary.variables.values():
         entry = variable.entry
-        check = variable.check
         value = variable.value
-        if entry.index in CHECKED and check is not None and isinstance(value, int):
-            try:
-                check(value)
-            except SdoAbort as error:
-                of = f" (node-ID {node_id})" if entry.relative else ""
-                mistake = f"DefaultValue {value:#x}{of} is not allowed ({error})."
-                yield f"{entry.place} {entry.name}: {mistake}"
+        if entry.index not in CHECKED or variable.check is None:
+            continue
+        if not isinstance(value, int):
+            continue
+        try:
+            variable.check(value)
+        except SdoAbort as error:
+            of_node = f" (node-ID {node_id})" if entry.relative else ""
+            problem = f"DefaultValue {value:#x}{of_node} is not allowed ({error})."
+            yield f"{entry.place} {entry.name}: {problem}"
     for tpdo in node.tpdos:
         try:
             tpdo.read()
             tpdo.check()
         except SdoAbort as error:
-            index = tpdo.communication_index
-            mapping = tpdo.mapping_index
+            parameters = f"{tpdo.communication_index:04X}h and {tpdo.mapping_index:04X}h"
             yield (
-                f"TPDO {tpdo.number + 1}: the defaults of {index:04X}h and {mapping:04X}h "
+                f"TPDO {tpdo.number + 1}: the defaults of {parameters} "
                 f"do not make a PDO of node {node_id} ({error}). "
                 "Map objects with PDOMapping=1, in their own lengths, 64 bits in all, "
                 "at a COB-ID that is free."
@@ -176,17 +190,18 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
 
 
 def _shared_ids(dictionary: Dictionary, node_ids: Sequence[int]) -> Iterator[str]:
-    """Yield the COB-IDs that two defaults share, in one node or two. Each pair of objects once."""
+    """Yield COB-IDs that two defaults share, of one node or of two. Each pair is named once."""
     sync = dictionary.number(0x1005) & 0x7FF
     users = {sync: (0x1005, "1005h:00")}
-    found = set()
+    named = set()
     for node_id in node_ids:
         for index, sub, cob_id in default_ids(dictionary, node_id):
-            who = f"{index:04X}h:{sub:02X} of node {node_id}"
-            other, whose = users.setdefault(cob_id, (index, who))
-            if whose != who and (other, index) not in found:
-                found.add((other, index))
-                yield (
-                    f"COB-ID {cob_id:03X}h is that of {whose} and of {who}. "
-                    "Change one DefaultValue (or add $NODEID)."
-                )
+            user = f"{index:04X}h:{sub:02X} of node {node_id}"
+            other_index, other_user = users.setdefault(cob_id, (index, user))
+            if other_user == user or (other_index, index) in named:
+                continue
+            named.add((other_index, index))
+            yield (
+                f"COB-ID {cob_id:03X}h is that of {other_user} and of {user}. "
+                "Change one DefaultValue (or add $NODEID)."
+            )
