@@ -35,7 +35,7 @@ class WrongObject(RuntimeError):
 
 
 def load(path: Path) -> Any:
-    """Return the shared object with its functions declared. Raises WrongObject if it does not fit."""
+    """Return the shared object with its functions declared. Raises WrongObject if it is wrong."""
     try:
         library: Any = c.PyDLL(str(path))  # other threads of Python run only while a turn waits
         released: Any = c.CDLL(str(path))

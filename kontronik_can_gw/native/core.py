@@ -210,7 +210,7 @@ class NativeCore:
         return min(found, self._slots.next_deadline())
 
     def deadline_in_python(self) -> int:
-        """Return the next deadline of ``advance_in_python``; 0 while one of its slots is pending."""
+        """Return the deadline of ``advance_in_python``. 0 while one of its slots is pending."""
         return 0 if self._slots.is_pending else self._slots.next_deadline()
 
     def turns(self) -> Turns:

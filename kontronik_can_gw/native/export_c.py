@@ -1,6 +1,8 @@
-"""Core and tables as C for a firmware: the sources of the core as they are, the tables as constants, an example, a page about it.
+"""Exports the core and its tables as C for a firmware.
 
-What a DBC does not need is left out by the defaults of core.h's macros. The tables are those that the binding has (``Tables.arrays``).
+The folder has the sources of the core, wire.h, the tables as constants, an example and a page. The
+defaults of the macros in core.h leave out parts that the DBC does not need. The tables are the same
+as for the shared object (``Tables.arrays``).
 """
 
 import ctypes
@@ -18,9 +20,9 @@ from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.signals.plan import Layout
 
 MARK = "made by kontronik-can-gw export c"
-"""In the first line of every file: a later export may replace it."""
+"""Text in the first line of every file. A later export may replace a file that has it."""
 EXAMPLE = "example_main.c"
-"""The user's own as soon as it is there."""
+"""An existing file with this name belongs to the user and is never replaced."""
 _CLASSIC = 8
 _LARGE = 1 << 15
 _WIDTH = 118
@@ -29,9 +31,13 @@ _WIDTH = 118
 def exported(
     layout: Layout, escs: Sequence[EscSettings], silent: bool, licence: str
 ) -> dict[str, str]:
-    """Text of each file by its name. NotInCore where the core in C cannot express the layout or an ESC's settings."""
+    """Return the text of each file by its name.
+
+    Raises NotInCore if the core in C cannot express the layout or an ESC's settings.
+    """
     tables = Tables(layout, escs, silent)
-    core_c, core_h = ((FOLDER / name).read_text(encoding="utf-8") for name in ("core.c", "core.h"))
+    core_c = (FOLDER / "core.c").read_text(encoding="utf-8")
+    core_h = (FOLDER / "core.h").read_text(encoding="utf-8")
     for name, value in _options(layout, tables).items():
         core_h, count = re.subn(rf"(#define {name} +)\d+", rf"\g<1>{value}", core_h)
         assert count == 1, name
@@ -65,7 +71,7 @@ def exported(
 
 
 def _options(layout: Layout, tables: Tables) -> dict[str, int]:
-    """Macros of core.h, as this layout needs them."""
+    """Return the values of core.h's macros that this layout needs."""
     longest = max((plan.length for plan in layout.messages), default=0)
     return {
         "KCG_DATA": _CLASSIC if longest <= _CLASSIC else 64,
@@ -76,12 +82,13 @@ def _options(layout: Layout, tables: Tables) -> dict[str, int]:
 
 
 def _header(dbc: str, tables: Tables, names: Sequence[str], escs: Sequence[EscSettings]) -> str:
-    """Names of messages and ESCs: their places, ids (bit 31: 29 bits) and lengths."""
+    """Return tables.h: names of messages and ESCs, with their numbers, ids and lengths."""
     places = _names("KCG_ESC_", [esc.name for esc in escs])
     rows = []
     for name, row in zip(names, tables.messages, strict=True):
         _, can_id, length = _forms(name)
         rows.append(f"#define {can_id} {_id(row)}u\n#define {length} {row.length}")
+    memory = f"KCG_MESSAGES, 0, KCG_ESCS, {tables.pages}, {len(tables.constants)}"
     parts = (
         "#ifndef KCG_TABLES_H",
         "#define KCG_TABLES_H",
@@ -93,7 +100,7 @@ def _header(dbc: str, tables: Tables, names: Sequence[str], escs: Sequence[EscSe
         "/* ESCs: the number of each in calls of the core. */",
         f"enum {{ {', '.join([*places, 'KCG_ESCS'])} }};\n",
         "/* Bytes for kcg_init. */",
-        f"#define KCG_MEMORY KCG_SIZE(KCG_MESSAGES, 0, KCG_ESCS, {tables.pages}, {len(tables.constants)})\n",
+        f"#define KCG_MEMORY KCG_SIZE({memory})\n",
         "#ifdef __cplusplus",
         'extern "C" {',
         "#endif",
@@ -108,7 +115,7 @@ def _header(dbc: str, tables: Tables, names: Sequence[str], escs: Sequence[EscSe
 
 
 def _tables(tables: Tables) -> Iterator[str]:
-    """Lines of the tables' definitions."""
+    """Yield the lines of tables.c."""
     yield '#include "tables.h"'
     for name, (kind, rows) in tables.arrays.items():
         label = tables.names.get(name)
@@ -130,26 +137,27 @@ def _type(name: str, kind: Any) -> str:
 
 
 def _rows(kind: Any, rows: Sequence[Any], labels: Sequence[str] | None) -> Iterator[str]:
-    """Lines of a table's rows; fields that are 0 are left out."""
+    """Yield the lines of a table's rows. Fields that are 0 are left out."""
     if not issubclass(kind, ctypes.Structure):
-        numbers = [_number(kind, getattr(row, "value", row)) for row in rows]
+        values = [getattr(row, "value", row) for row in rows]
+        numbers = [_number(kind, value) for value in values]
         each = 4 if ctypes.sizeof(kind) > 4 else 16
         for at in range(0, len(numbers), each):
             yield f"    {', '.join(numbers[at : at + each])},"
         return
     for place, row in enumerate(rows):
-        fields = [
-            f".{name} = {_number(typed, value)}"
-            for name, typed in kind._fields_
-            if isinstance(value := getattr(row, name), int) and value
-        ]
+        fields = []
+        for name, typed in kind._fields_:
+            value = getattr(row, name)
+            if isinstance(value, int) and value:
+                fields.append(f".{name} = {_number(typed, value)}")
         if labels:
             yield f"    /* {_plain(labels[place])} */"
         yield f"    {{{', '.join(fields) or '0'}}},"
 
 
 def _number(kind: Any, value: int) -> str:
-    """A constant of a type that holds it, whatever the width of int."""
+    """Return a constant whose type can hold it, whatever the width of int is."""
     if abs(value) < _LARGE:
         return str(value)
     if kind is ctypes.c_int64:
@@ -162,17 +170,21 @@ def _id(row: Any) -> str:
 
 
 def _names(prefix: str, texts: Sequence[str]) -> list[str]:
-    """A C identifier for each, no two the same, and none that core.h has, as an id or a length neither."""
+    """Return a different C identifier for each text.
+
+    Neither it nor the names of its id and length are names of the headers.
+    """
     headers = wire_header() + (FOLDER / "core.h").read_text(encoding="utf-8")
     taken = set(re.findall(r"KCG_\w+", headers))
-    found: dict[str, None] = {}
+    found: list[str] = []
     for text in texts:
         name = base = prefix + re.sub(r"\W", "_", text, flags=re.ASCII)
         number = 2
         while name in found or not taken.isdisjoint(_forms(name)):
-            name, number = f"{base}_{number}", number + 1
-        found[name] = None
-    return list(found)
+            name = f"{base}_{number}"
+            number += 1
+        found.append(name)
+    return found
 
 
 def _forms(name: str) -> list[str]:
@@ -180,5 +192,5 @@ def _forms(name: str) -> list[str]:
 
 
 def _plain(text: str) -> str:
-    """For a comment or a page: ends neither, and is ASCII."""
+    """Return ASCII text that can be in a comment or on a page without ending it."""
     return re.sub(r"[^\w .,+()-]", "_", text, flags=re.ASCII)

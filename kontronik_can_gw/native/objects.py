@@ -23,7 +23,8 @@ _IN_32_BITS = {"x86_64": "i686", "aarch64": "armv7l", "armv8l": "armv7l"}
 def shared_object(machine: str = "") -> Path:
     """Return the path of the object for a machine, whether it exists or not.
 
-    Without ``machine``, it is the path for this process, which can have 32 bits on a 64-bit machine.
+    Without ``machine`` it is the path for this process, which can be a 32-bit process on a 64-bit
+    machine.
     """
     if not machine:
         machine = os.uname().machine

@@ -6,10 +6,18 @@
 #define SECOND (1000 * MS)
 #define END_OF_TIME (INT64_C(1) << 61)
 #define MAX_COUNT (INT64_C(1) << 48)
-#define SAME_ROW (5 * MS)
-#define GATEWAY_EACH (100 * MS)
-enum { BYTES = 1, FRAME = 2, ADVANCE = 3, COUNTERS = 14, NOT_SENT = 18 }; /* capture/format.py, Kind */
-enum { COUNT = 4, ENTRY = 16, TIME = 8, SENT_FRAMES = 4, COUNTERS_COUNT = 8, MAGIC = 3 };
+#define SAME_ROW (5 * MS)       /* Readings of several ESCs within this time are in one row. */
+#define GATEWAY_EACH (100 * MS) /* Between two reads of the gateway's values. */
+/* Kinds of entries (twin: capture/format.py, Kind). */
+enum { BYTES = 1, FRAME = 2, ADVANCE = 3, COUNTERS = 14, NOT_SENT = 18 };
+enum {
+    COUNT = 4,                     /* Bytes of a block's number of entries. */
+    ENTRY = 16,                    /* Bytes of an entry. */
+    TIME = 8,                      /* Bytes of a time. */
+    SENT_FRAMES = KCG_SENT_FRAMES, /* The first counter of a COUNTERS entry in kcg.gateway. */
+    COUNTERS_COUNT = 8,            /* Number of its counters. The last one is a time. */
+    MAGIC = 3                      /* Bytes of "KOD". */
+};
 
 static uint32_t u32(const uint8_t *p)
 {
@@ -21,14 +29,15 @@ static uint64_t u64(const uint8_t *p)
     return u32(p) | (uint64_t)u32(p + 4) << 32;
 }
 
-/* --- rows (twin: samples.py) ----------------------------------------------------------------------------------------- */
+/* --- rows (twin: desk/recordings/samples.py) -------------------------------------------------- */
 
-/* As Python's round(x, 6): the nearest to the exact value, halves to even. Every product and difference is exact or of the right sign. */
+/* Returns Python's round(x, 6): the nearest to the exact value, halves to even. Each product and
+   each difference is exact or has the right sign. */
 static double six_decimals(double x)
 {
     double a = x < 0 ? -x : x, high;
     uint64_t bits;
-    if (!(a < 8589934592.0)) /* 2^33: floats are further apart than that */
+    if (!(a < 8589934592.0)) /* from 2^33 on, doubles are further apart than six decimals */
         return x;
     memcpy(&bits, &a, sizeof bits);
     bits &= ~UINT64_C(0x3FFF);
@@ -40,6 +49,7 @@ static double six_decimals(double x)
     return x < 0 ? -((double)n / 1e6) : (double)n / 1e6;
 }
 
+/* Reads the current values of the columns `from` to `to` - 1. */
 static void read_columns(kcg_offline *o, uint32_t from, uint32_t to, int64_t now)
 {
     for (kcg_column *c = o->column + from, *end = o->column + to; c < end; c++) {
@@ -81,8 +91,8 @@ void kcg_row_event(kcg_offline *o, int esc, int events, int64_t now)
         return;
     int64_t when = now, least = o->is_open ? o->row_ns : o->last_row_ns;
     if (events & KCG_LIVE && e->has_live && e->live_ns < when)
-        when = e->live_ns; /* of its last byte on the wire */
-    if (when < least) /* rows do not go back */
+        when = e->live_ns; /* the time of its last byte on the wire */
+    if (when < least) /* the times of rows do not decrease */
         when = least;
     if (o->is_open && ((events & KCG_LIVE && o->in_row[esc]) || when - o->row_ns > SAME_ROW))
         kcg_close_row(o);
@@ -96,13 +106,16 @@ void kcg_row_event(kcg_offline *o, int esc, int events, int64_t now)
     }
     if (events & KCG_LIVE) {
         o->in_row[esc] = 1;
-        if (!o->is_open)
-            o->is_open = 1, o->row_ns = when;
+        if (!o->is_open) {
+            o->is_open = 1;
+            o->row_ns = when;
+        }
     }
 }
 
-/* --- the calls of a recording (twin: replay.py) ---------------------------------------------------------------------- */
+/* --- calls of a recording (twin: capture/replay.py) ------------------------------------------- */
 
+/* Follows the event that a call of the core returned, and all further ones. */
 static void follow(kcg_offline *o, int found, int64_t now)
 {
     for (; found >= 0; found = kcg_next_event(o->core))
@@ -110,7 +123,8 @@ static void follow(kcg_offline *o, int found, int64_t now)
             kcg_row_event(o, found >> 8, found & 255, now);
 }
 
-static void receive(kcg_offline *o, int esc, const uint8_t *data, size_t size, int64_t now, int64_t since)
+static void receive(kcg_offline *o, int esc, const uint8_t *data, size_t size, int64_t now,
+                    int64_t since)
 {
     do {
         size_t part = size < KCG_MAX_READ ? size : KCG_MAX_READ;
@@ -118,7 +132,8 @@ static void receive(kcg_offline *o, int esc, const uint8_t *data, size_t size, i
         while ((found = kcg_receive(o->core, esc, data, part, now, since)) >= KCG_AGAIN)
             follow(o, found & ~KCG_AGAIN, now);
         follow(o, found, now);
-        data += part, size -= part;
+        data += part;
+        size -= part;
     } while (size);
 }
 
@@ -127,17 +142,23 @@ static void advance(kcg_offline *o, int64_t now)
     follow(o, kcg_advance(o->core, now), now);
     if (o->column)
         return;
-    for (uint32_t n; (n = kcg_take(o->core, now, o->frame + o->count, o->room - o->count)) != 0; o->count += n) {
-        for (uint32_t k = 0; k < n; k++)
+    for (;;) {
+        uint32_t count = kcg_take(o->core, now, o->frame + o->count, o->room - o->count);
+        if (!count)
+            return;
+        for (uint32_t k = 0; k < count; k++)
             o->frame_time[o->count + k] = now;
-        kcg_sent(o->core, now, n);
+        kcg_sent(o->core, now, count);
+        o->count += count;
     }
 }
 
-/* Whether what one call can give may find no room. */
+/* Returns 1 if there may be no room for all that one call can make. */
 static int is_full(const kcg_offline *o)
 {
-    return o->column ? o->rows + KCG_MAX_ROWS > o->room : o->count + o->core->plan->pages > o->room;
+    if (o->column)
+        return o->rows + KCG_MAX_ROWS > o->room;
+    return o->count + o->core->plan->pages > o->room;
 }
 
 int kcg_is_intact(const uint8_t *p, size_t size)
@@ -155,10 +176,13 @@ int kcg_is_intact(const uint8_t *p, size_t size)
     return at == size;
 }
 
-/* Whether a COUNTERS entry holds what a gateway can have counted (twin: capture/limits.py, check_counters). */
+/* Returns 1 if a gateway can have counted the numbers of a COUNTERS entry (twin: capture/limits.py,
+   check_counters). */
 static int are_counters(const uint8_t *data, uint32_t length)
 {
-    if (length != COUNTERS_COUNT * TIME || u64(data + (COUNTERS_COUNT - 1) * TIME) >= END_OF_TIME)
+    if (length != COUNTERS_COUNT * TIME)
+        return 0;
+    if (u64(data + (COUNTERS_COUNT - 1) * TIME) >= END_OF_TIME)
         return 0;
     for (int k = 0; k < COUNTERS_COUNT - 1; k++)
         if (u64(data + k * TIME) >= MAX_COUNT)
@@ -171,18 +195,24 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
     uint32_t count = u32(p);
     (void)size;
     for (; o->index < count; o->index++) {
-        const uint8_t *e = p + COUNT + (size_t)o->index * ENTRY, *data = p + o->data_at;
-        uint32_t kind = e[8], esc = e[10] | (uint32_t)e[11] << 8, length = u32(e + 12), before = o->count;
+        const uint8_t *e = p + COUNT + (size_t)o->index * ENTRY;
+        const uint8_t *data = p + o->data_at;
+        uint32_t kind = e[8];
+        uint32_t esc = e[10] | (uint32_t)e[11] << 8;
+        uint32_t length = u32(e + 12);
+        uint32_t before = o->count;
         uint64_t time = u64(e);
         if (time >= END_OF_TIME || o->last >= END_OF_TIME)
             return KCG_OTHER_ENTRY;
         int64_t now = (int64_t)time > o->last ? (int64_t)time : o->last;
         if (kind == BYTES) {
-            if (esc >= o->core->plan->escs || u64(data) >= END_OF_TIME || length - TIME > KCG_MAX_READ)
+            uint64_t since = u64(data);
+            int has_esc = esc < o->core->plan->escs;
+            if (!has_esc || since >= END_OF_TIME || length - TIME > KCG_MAX_READ)
                 return KCG_OTHER_ENTRY;
             if (is_full(o))
                 return KCG_IS_FULL;
-            receive(o, (int)esc, data + TIME, length - TIME, now, (int64_t)u64(data));
+            receive(o, (int)esc, data + TIME, length - TIME, now, (int64_t)since);
         } else if (kind == ADVANCE) {
             if (is_full(o))
                 return KCG_IS_FULL;
@@ -203,9 +233,9 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
     return KCG_ALL_DONE;
 }
 
-/* --- plain bytes, which have no times (twin: bytes_input.py) --------------------------------------------------------- */
+/* --- plain bytes, which have no times (twin: desk/recordings/bytes_input.py) ------------------ */
 
-/* Let time pass until `now`. 0 where there is no room for what may come of it. */
+/* Lets time pass until `now`. Returns 0 if there may be no room for the frames or rows. */
 static int catch_up(kcg_offline *o, int64_t now)
 {
     for (;;) {
@@ -218,23 +248,30 @@ static int catch_up(kcg_offline *o, int64_t now)
     }
 }
 
-/* The next frame that was found, at its time: to the core as it is, with the counters of what found it. */
+/* Gives the core the next found frame, at its time, with the counters of the finder. Returns 0 if
+   there may be no room. */
 static int give_frame(kcg_offline *o)
 {
     static const uint8_t first_after = KCG_N_LONG_RUN_BYTES + 1;
     const kcg_found *f = &o->found[o->found_at];
     kcg *g = o->core;
     if (!o->is_timed) {
+        /* Info data are half a period before the next live data. */
         int64_t half = o->lives * o->period - o->period / 2;
-        o->now = !f->is_info ? o->lives++ * o->period : half > o->now ? half : o->now;
+        if (!f->is_info)
+            o->now = o->lives++ * o->period;
+        else if (half > o->now)
+            o->now = half;
         o->is_timed = 1;
     }
     memcpy(g->esc[0].count, o->finder->esc[0].count, first_after * sizeof *g->esc[0].count);
     if (!catch_up(o, o->now))
         return 0;
     g->found[0] = *f;
-    g->found_at = 0, g->found_count = 1;
-    g->read_esc = 0, g->read_end = f->end;
+    g->found_at = 0;
+    g->found_count = 1;
+    g->read_esc = 0;
+    g->read_end = f->end;
     g->read_now = g->read_shown = g->read_bound = o->now;
     follow(o, kcg_next_event(g), o->now);
     advance(o, o->now);
@@ -246,7 +283,8 @@ static int give_frame(kcg_offline *o)
 static void collect(kcg_offline *o)
 {
     const kcg *from = o->finder;
-    for (uint32_t k = 0; k < from->found_count && o->found_count < sizeof o->found / sizeof *o->found; k++)
+    const size_t room = sizeof o->found / sizeof *o->found;
+    for (uint32_t k = 0; k < from->found_count && o->found_count < room; k++)
         o->found[o->found_count++] = from->found[k];
 }
 
@@ -259,7 +297,8 @@ static void find(kcg_offline *o, const uint8_t *data, size_t size)
     }
 }
 
-/* Where the next header begins. Without one, the end of the bytes, less a header that is not complete. */
+/* Returns the index of the next header. If there is none, the end of the bytes without an
+   incomplete header. */
 static size_t piece_end(const uint8_t *b, size_t from, size_t size, int ended)
 {
     for (size_t at = from + 1; at + MAGIC <= size; at++) {
@@ -302,9 +341,10 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
     }
 }
 
-/* --- text (twins: can_logs/writer.py, tables.py) ---------------------------------------------------------------- */
+/* --- text (twins: can_logs/writer.py, desk/recordings/tables.py) ------------------------------ */
 
-typedef struct { char of[256][2]; } kcg_pairs; /* the two hex digits of each byte */
+/* The two hex digits of each byte. */
+typedef struct { char of[256][2]; } kcg_pairs;
 
 static void make_pairs(kcg_pairs *pairs)
 {
@@ -342,7 +382,8 @@ static char *put(char *p, const char *text)
     return p;
 }
 
-size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int64_t shift, const char *channel, char *out)
+size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int64_t shift,
+                   const char *channel, char *out)
 {
     char *p = out, *head = out;
     size_t head_size = 0, second_size = 0;
@@ -351,7 +392,9 @@ size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int6
     make_pairs(&pairs);
     for (uint32_t k = 0; k < count; k++, f++) {
         if (k && time[k] == time[k - 1]) {
-            for (size_t at = 0; at < head_size; at += 16) /* in pieces of which the compiler knows the size; a line is longer */
+            /* Copy in pieces of a constant size, which is fast. The rest of the line overwrites
+               the bytes beyond head_size. */
+            for (size_t at = 0; at < head_size; at += 16)
                 memcpy(p + at, head + at, 16);
             p += head_size;
         } else {
@@ -359,13 +402,17 @@ size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int6
             const char *before = head + 1;
             head = p;
             *p++ = '(';
-            if (second_size && us / 1000000 == second)
+            if (second_size && us / 1000000 == second) {
                 memcpy(p, before, 16);
-            else
-                second = us / 1000000, second_size = (size_t)(decimal(p, second) - p);
+            } else {
+                second = us / 1000000;
+                second_size = (size_t)(decimal(p, second) - p);
+            }
             p += second_size;
-            *p++ = '.', p = digits(p, us % 1000000, 6);
-            *p++ = ')', *p++ = ' ';
+            *p++ = '.';
+            p = digits(p, us % 1000000, 6);
+            *p++ = ')';
+            *p++ = ' ';
             p = put(p, channel);
             *p++ = ' ';
             head_size = (size_t)(p - head);
@@ -374,20 +421,24 @@ size_t kcg_candump(const kcg_frame *f, const int64_t *time, uint32_t count, int6
             for (int at = 24; at >= 8; at -= 8)
                 p = hex_byte(p, &pairs, (f->id & 0x7FFFFFFF) >> at);
         } else {
-            *p++ = (char)('0' + (f->id >> 8)); /* of 11 bits */
+            *p++ = (char)('0' + (f->id >> 8)); /* an id with 11 bits has three digits */
         }
         p = hex_byte(p, &pairs, f->id);
         *p++ = '#';
-        if (f->flags)
-            *p++ = '#', *p++ = '1'; /* CAN FD with a switched bit rate */
+        if (f->flags) { /* CAN FD with a switched bit rate */
+            *p++ = '#';
+            *p++ = '1';
+        }
         for (int at = 0; at < f->length; at++)
             p = hex_byte(p, &pairs, f->data[at]);
-        *p++ = ' ', *p++ = 'T', *p++ = '\n';
+        *p++ = ' ';
+        *p++ = 'T';
+        *p++ = '\n';
     }
     return (size_t)(p - out);
 }
 
-/* As Python's str of a float that has six decimals at most; NULL for any other. */
+/* Writes a double as Python's str does. Returns NULL if it has more than six decimals. */
 static char *real_text(char *p, double v)
 {
     double a = v < 0 ? -v : v;
@@ -400,8 +451,10 @@ static char *real_text(char *p, double v)
         *p++ = '-';
     if (n && n < 100) {
         *p++ = (char)('0' + (n < 10 ? n : n / 10));
-        if (n >= 10 && n % 10)
-            *p++ = '.', *p++ = (char)('0' + n % 10);
+        if (n >= 10 && n % 10) {
+            *p++ = '.';
+            *p++ = (char)('0' + n % 10);
+        }
         return put(p, n < 10 ? "e-06" : "e-05");
     }
     p = decimal(p, n / 1000000);
@@ -412,29 +465,45 @@ static char *real_text(char *p, double v)
     return p;
 }
 
+/* Seconds with six decimals, or with nine if the time is not a whole number of microseconds. */
 static char *seconds_text(char *p, int64_t ns)
 {
     p = decimal(p, (uint64_t)(ns / SECOND));
     *p++ = '.';
-    return ns % 1000 ? digits(p, (uint64_t)(ns % SECOND), 9) : digits(p, (uint64_t)(ns % SECOND / 1000), 6);
+    uint64_t rest = (uint64_t)(ns % SECOND);
+    return ns % 1000 ? digits(p, rest, 9) : digits(p, rest / 1000, 6);
 }
 
-/* ISO 8601 with microseconds, of years 1970 to 9999 (days to dates: H. Hinnant, chrono-compatible low-level date algorithms). */
-static char *utc_text(char *p, int64_t ns)
+static char *digits_and(char *p, uint64_t n, int count, char after)
 {
-    uint64_t second = (uint64_t)(ns / SECOND), of_day = second % 86400, days = second / 86400 + 719468, era = days / 146097, of_era = days % 146097;
-    uint64_t year = (of_era - of_era / 1460 + of_era / 36524 - of_era / 146096) / 365, of_year = of_era - (365 * year + year / 4 - year / 100);
-    uint64_t m = (5 * of_year + 2) / 153, month = m < 10 ? m + 3 : m - 9;
-    p = digits(p, era * 400 + year + (month <= 2), 4), *p++ = '-';
-    p = digits(p, month, 2), *p++ = '-';
-    p = digits(p, of_year - (153 * m + 2) / 5 + 1, 2), *p++ = 'T';
-    p = digits(p, of_day / 3600, 2), *p++ = ':';
-    p = digits(p, of_day / 60 % 60, 2), *p++ = ':';
-    p = digits(p, of_day % 60, 2), *p++ = '.';
-    p = digits(p, (uint64_t)(ns % SECOND / 1000), 6), *p++ = 'Z';
+    p = digits(p, n, count);
+    *p++ = after;
     return p;
 }
 
+/* ISO 8601 with microseconds, for the years 1970 to 9999. The date is computed as in H. Hinnant,
+   chrono-compatible low-level date algorithms: years begin in March, and eras have 400 years. */
+static char *utc_text(char *p, int64_t ns)
+{
+    uint64_t second = (uint64_t)(ns / SECOND);
+    uint64_t of_day = second % 86400;
+    uint64_t days = second / 86400 + 719468;
+    uint64_t era = days / 146097;
+    uint64_t of_era = days % 146097;
+    uint64_t year = (of_era - of_era / 1460 + of_era / 36524 - of_era / 146096) / 365;
+    uint64_t of_year = of_era - (365 * year + year / 4 - year / 100);
+    uint64_t m = (5 * of_year + 2) / 153;
+    uint64_t month = m < 10 ? m + 3 : m - 9;
+    p = digits_and(p, era * 400 + year + (month <= 2), 4, '-');
+    p = digits_and(p, month, 2, '-');
+    p = digits_and(p, of_year - (153 * m + 2) / 5 + 1, 2, 'T');
+    p = digits_and(p, of_day / 3600, 2, ':');
+    p = digits_and(p, of_day / 60 % 60, 2, ':');
+    p = digits_and(p, of_day % 60, 2, '.');
+    return digits_and(p, (uint64_t)(ns % SECOND / 1000), 6, 'Z');
+}
+
+/* Writes a value. Returns NULL if the number needs another way. */
 static char *cell_text(char *p, const kcg_cell *c, uint32_t row, const char *nothing)
 {
     p = put(p, c->prefix);
@@ -449,19 +518,25 @@ static char *cell_text(char *p, const kcg_cell *c, uint32_t row, const char *not
                 return put(p, c->word[k].text);
         return put(p, nothing);
     }
-    if (number < 0)
-        *p++ = '-';
-    return decimal(p, number < 0 ? 0 - (uint64_t)number : (uint64_t)number);
+    if (number >= 0)
+        return decimal(p, (uint64_t)number);
+    *p++ = '-';
+    return decimal(p, 0 - (uint64_t)number);
 }
 
-size_t kcg_lines(const kcg_cell *cell, uint32_t cells, const kcg_style *style, const int64_t *time, uint32_t from, uint32_t to, int64_t origin,
-                 int64_t wall, char *out, size_t room, size_t longest, uint32_t *done)
+size_t kcg_lines(const kcg_cell *cell, uint32_t cells, const kcg_style *style, const int64_t *time,
+                 uint32_t from, uint32_t to, int64_t origin, int64_t wall, char *out, size_t room,
+                 size_t longest, uint32_t *done)
 {
     char *line = out;
     for (*done = from; *done < to && room - (size_t)(line - out) >= longest; ++*done) {
-        char *p = seconds_text(put(line, style->head), time[*done] - origin);
-        if (style->utc)
-            p = put(utc_text(put(p, style->utc), time[*done] + wall), style->utc_end);
+        char *p = put(line, style->head);
+        p = seconds_text(p, time[*done] - origin);
+        if (style->utc) {
+            p = put(p, style->utc);
+            p = utc_text(p, time[*done] + wall);
+            p = put(p, style->utc_end);
+        }
         for (uint32_t k = 0; p && k < cells; k++)
             p = cell_text(p, &cell[k], *done, style->nothing);
         if (!p)

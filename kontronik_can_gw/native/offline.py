@@ -1,4 +1,4 @@
-"""What comes of a recording that the core in C plays at full speed (player.py): frames and rows in blocks, and their text (offline.c)."""
+"""Frames and rows of a recording that the core in C plays (player.py), and their text."""
 
 import ctypes as c
 from collections.abc import Iterator, Sequence
@@ -12,48 +12,51 @@ from kontronik_can_gw.native.header import KCG, structure
 
 ROWS = 1 << 13
 _TEXT = 1 << 20
-_Word, _Cell = structure("kcg_word"), structure("kcg_cell")
+_Word = structure("kcg_word")
+_Cell = structure("kcg_cell")
 Style: Any = structure("kcg_style")
-"""Of lines: what stands before the time, before and after the Unix time (None: none), at the end, for what is not available."""
+"""Texts of lines: before the time, around the Unix time (or None), at the end, for no value."""
 
 
 def _address(memory: bytearray) -> int:
-    """Of memory that is there, and is not made longer, while the address is used."""
+    """Return the address of memory. While it is used, the memory must exist and must not grow."""
     return c.addressof(c.c_char.from_buffer(memory))
 
 
 class FrameRoom:
-    """Room for frames, their times and the text of both, used again and again."""
+    """Memory for frames, their times and their text. It is used again and again."""
 
     def __init__(self, library: Any, size: int) -> None:
-        self.library, self.size = library, size
-        self.frames, self.times = (Frame * size)(), (c.c_int64 * size)()
+        self.library = library
+        self.size = size
+        self.frames = (Frame * size)()
+        self.times = (c.c_int64 * size)()
         self._text: Any = None
 
     def move_to(self, other: "FrameRoom", begin: int, count: int) -> None:
-        """Copy some to the beginning of another one."""
-        for mine, its, size in (
-            (self.frames, other.frames, c.sizeof(Frame)),
-            (self.times, other.times, 8),
-        ):
-            c.memmove(its, c.addressof(mine) + size * begin, size * count)
+        """Copy ``count`` frames from index ``begin`` on to the beginning of another room."""
+        size = c.sizeof(Frame)
+        c.memmove(other.frames, c.addressof(self.frames) + size * begin, size * count)
+        c.memmove(other.times, c.addressof(self.times) + 8 * begin, 8 * count)
 
     def candump(self, begin: int, end: int, shift_ns: int, channel: str) -> memoryview:
-        """As Frames.candump."""
-        name, count = channel.encode(), end - begin
-        room = count * (len(name) + 190)
-        if self._text is None or len(self._text) < room:
-            self._text = c.create_string_buffer(self.size * (len(name) + 190))
-        length = self.library.kcg_candump(
-            c.byref(self.frames, begin * c.sizeof(Frame)),
-            c.byref(self.times, begin * 8),
-            *(count, shift_ns, name, self._text),
-        )
+        """Return lines of a candump log (see Frames.candump)."""
+        name = channel.encode()
+        count = end - begin
+        longest_line = len(name) + 190
+        if self._text is None or len(self._text) < count * longest_line:
+            self._text = c.create_string_buffer(self.size * longest_line)
+        frames = c.byref(self.frames, begin * c.sizeof(Frame))
+        times = c.byref(self.times, begin * 8)
+        length = self.library.kcg_candump(frames, times, count, shift_ns, name, self._text)
         return memoryview(self._text).cast("B")[:length]
 
 
 class Frames:
-    """Frames that were sent: ``times`` in ns, which do not decrease. They are there until the one after the next is taken."""
+    """Frames that were sent, with ``times`` in ns that do not decrease.
+
+    They remain valid until ``take_frames`` has been called twice more.
+    """
 
     def __init__(self, room: FrameRoom, begin: int, end: int) -> None:
         self._room, self._begin, self._end = room, begin, end
@@ -63,7 +66,7 @@ class Frames:
         return self._end - self._begin
 
     def part(self, begin: int, end: int) -> "Frames":
-        """Some of them."""
+        """Return the frames ``begin`` to ``end``."""
         return Frames(self._room, self._begin + begin, self._begin + end)
 
     def __iter__(self) -> Iterator[tuple[int, CanFrame]]:
@@ -72,19 +75,22 @@ class Frames:
         return zip(self.times, frames, strict=True)
 
     def candump(self, shift_ns: int, channel: str) -> memoryview:
-        """Lines of a candump log, with microseconds of the time and ``shift_ns``; to be written before others are asked for."""
+        """Return lines of a candump log, with the microseconds of time + ``shift_ns``.
+
+        They are valid until the next call.
+        """
         return self._room.candump(self._begin, self._end, shift_ns, channel)
 
 
 class ColumnOf(NamedTuple):
-    """A value that is wanted in a column. ``esc``: its index, None for the gateway."""
+    """A value for a column. ``esc`` is the index of the ESC, or None for the gateway."""
 
     value: Value
     esc: int | None
 
     @property
     def form(self) -> Any:
-        """How steps become a number of its unit."""
+        """Return how steps become a number of the value's unit (kcg_column.form)."""
         per_unit = self.value.per_unit
         if self.value.divisor is Divisor.ONE:
             if self.value.names or per_unit == 1:
@@ -95,7 +101,11 @@ class ColumnOf(NamedTuple):
 
 
 class Rows:
-    """Rows as columns: ``times`` in ns, and of each column ``values`` (int64 or float64) and ``valid`` (a bit a row, lowest first)."""
+    """Rows, stored as columns.
+
+    ``times`` are in ns. Each column has ``values`` (int64 or float64) and ``valid``: a bit for each
+    row, lowest bit first.
+    """
 
     def __init__(self, columns: Sequence[ColumnOf]) -> None:
         self.columns = columns
@@ -110,12 +120,14 @@ class Rows:
         return memoryview(self._times).cast("q")[: self.count]
 
     def values(self, column: int) -> Any:
-        """What stands where a row is not valid has no meaning."""
+        """Return the values of a column. Values of rows that are not valid have no meaning."""
         values = memoryview(self._values[column])
-        return (values.cast("d") if self.is_real[column] else values.cast("q"))[: self.count]
+        if self.is_real[column]:
+            return values.cast("d")[: self.count]
+        return values.cast("q")[: self.count]
 
     def numbers(self, column: int, begin: int, end: int) -> list[float | None]:
-        """Of the rows ``begin`` to ``end``; None where not available."""
+        """Return the values of the rows ``begin`` to ``end``, with None for not available."""
         found: list[float | None] = self.values(column)[begin:end].tolist()
         first = begin >> 3
         for at, bits in enumerate(self.valid[column][first : (end + 7) >> 3], first):
@@ -127,13 +139,13 @@ class Rows:
         return found
 
     def addresses(self) -> list[int]:
-        """Of the times, then of each column's values and valid bits."""
-        every = (self._times, *self._values, *self.valid)
-        return [*map(_address, every)]
+        """Return addresses: of the times, of each column's values, of each column's valid bits."""
+        arrays = [self._times, *self._values, *self.valid]
+        return [_address(array) for array in arrays]
 
 
 class Lines:
-    """Text of rows. Each cell: what stands before it, and texts by number; None for a number itself."""
+    """Text of rows. Each cell has a text before it, and texts of numbers or None for the number."""
 
     def __init__(
         self,
@@ -141,7 +153,8 @@ class Lines:
         style: Style,
         cells: Sequence[tuple[bytes, Sequence[tuple[int, bytes]] | None]],
     ) -> None:
-        self._library, self._style = library, style
+        self._library = library
+        self._style = style
         self._cells = (_Cell * max(1, len(cells)))()
         self._longest = 128
         self._kept: list[Any] = []
@@ -152,24 +165,39 @@ class Lines:
             if words is not None:
                 table = (_Word * max(1, len(words)))(*starmap(_Word, words))
                 self._kept.append(table)
-                cell.word, cell.words = c.addressof(table), len(words)
+                cell.word = c.addressof(table)
+                cell.words = len(words)
                 self._longest += max((len(text) for _, text in words), default=0)
 
     def of(
         self, rows: Rows, begin: int, end: int, origin_ns: int, wall_ns: int
     ) -> Iterator[bytes | int]:
-        """Lines of the rows ``begin`` to ``end``; for a row that needs another way its index. ``wall_ns`` added, times are Unix times."""
+        """Yield lines of the rows ``begin`` to ``end``, or the index of a row that C cannot write.
+
+        With ``wall_ns`` added, times are Unix times.
+        """
         times, *addresses = rows.addresses()
         count = len(rows.columns)
         for at in range(count):
             cell = self._cells[at]
-            cell.values, cell.valid = addresses[at], addresses[count + at]
+            cell.values = addresses[at]
+            cell.valid = addresses[count + at]
             cell.is_real = rows.is_real[at]
         done = c.c_uint32(begin)
         while done.value < end:
             length = self._library.kcg_lines(
-                *(self._cells, count, c.byref(self._style), times, done.value, end),
-                *(origin_ns, wall_ns, self._out, _TEXT, self._longest, c.byref(done)),
+                self._cells,
+                count,
+                c.byref(self._style),
+                times,
+                done.value,
+                end,
+                origin_ns,
+                wall_ns,
+                self._out,
+                _TEXT,
+                self._longest,
+                c.byref(done),
             )
             if length:
                 yield c.string_at(self._out, length)

@@ -1,7 +1,7 @@
-"""Plays a recording by the core in C at full speed (offline.c): a capture's entries, or the plain bytes of one ESC.
+"""Plays a recording with the core in C at full speed (offline.c): a capture, or bytes of one ESC.
 
-What a Player leaves to the caller, entries that come now and then, is given to the same core by the calls of its Gateway, whose outputs
-include the Player for the sake of its rows.
+A Player leaves rare entries to the caller, which gives them to the same core through its Gateway.
+The Player is one of the Gateway's outputs, so that its rows contain their events.
 """
 
 import ctypes as c
@@ -20,11 +20,15 @@ _FRAMES = 1 << 12
 _u32 = c.c_uint32
 
 
-_Offline, _Column = structure("kcg_offline"), structure("kcg_column")
+_Offline = structure("kcg_offline")
+_Column = structure("kcg_column")
 
 
 class Player(Output):
-    """Plays a recording. ``columns``: rows of these values are wanted; None: frames. A follower of its core for the rows' sake."""
+    """Plays a recording.
+
+    It makes rows of the values in ``columns``, or frames if ``columns`` is None.
+    """
 
     def __init__(self, columns: Sequence[ColumnOf] | None = None) -> None:
         super().__init__()
@@ -34,7 +38,7 @@ class Player(Output):
         self._count = 0
 
     def bind(self, core: NativeCore, now: int) -> None:
-        """Take the core that is to be played. NotInCore where it does not have one of the values."""
+        """Use this core for playing. Raises NotInCore if it does not have one of the values."""
         self._library = library = core.library
         self._settings = core.escs[0].settings
         self._state.core = core.core
@@ -69,54 +73,69 @@ class Player(Output):
             where = ([], []) if esc is None else places_of(core.escs[esc].protocol)
             bind(row.of, value, where, esc)
             row.of.esc = 255 if esc is None else esc
-            row.per_unit, row.form = value.per_unit, columns[number].form
+            row.per_unit = value.per_unit
+            row.form = columns[number].form
             if row.of.kind == KCG.OF_AGE:
                 ages.append(at)
         places = [place(number) for number in order]
-        begins = [bisect_left(places, (n, is_info)) for n in range(count + 1) for is_info in (0, 1)]
+        begins = []
+        for esc_number in range(count + 1):
+            begins.append(bisect_left(places, (esc_number, False)))
+            begins.append(bisect_left(places, (esc_number, True)))
         self._order = order
         self._first = (_u32 * len(begins))(*begins)
         self._ages = (_u32 * max(1, len(ages)))(*ages)
         state = self._state
-        state.column, state.first = c.addressof(table), c.addressof(self._first)
-        state.age, state.ages = c.addressof(self._ages), len(ages)
+        state.column = c.addressof(table)
+        state.first = c.addressof(self._first)
+        state.age = c.addressof(self._ages)
+        state.ages = len(ages)
 
     def _new_rows(self) -> None:
         assert self._columns is not None
         self._rows = Rows(self._columns)
         times, *addresses = self._rows.addresses()
-        self._state.row_time, self._state.rows = times, 0
-        values, valid = addresses[: len(self._columns)], addresses[len(self._columns) :]
+        self._state.row_time = times
+        self._state.rows = 0
+        values = addresses[: len(self._columns)]
+        valid = addresses[len(self._columns) :]
         for at, number in enumerate(self._order):
-            self._table[at].values, self._table[at].valid = values[number], valid[number]
+            column = self._table[at]
+            column.values = values[number]
+            column.valid = valid[number]
 
     # --- captures
 
     def begin(self, payload: bytes) -> bool:
-        """Take a data block (of version 2); False where it is damaged: nothing of it is taken."""
+        """Take a data block (of version 2). Return False, and take nothing, if it is damaged."""
         if not self._library.kcg_is_intact(payload, len(payload)):
             return False
         self._payload = payload
         self._count = int.from_bytes(payload[:4], "little")
-        self._state.index, self._state.data_at = 0, 4 + 16 * self._count
+        self._state.index = 0
+        self._state.data_at = 4 + 16 * self._count
         return True
 
     @property
     def next_kind(self) -> int | None:
-        """Of the next entry; None at the end of the block."""
+        """Kind of the next entry, or None at the end of the block."""
         index = self._state.index
         return self._payload[12 + 16 * index] if index < self._count else None
 
     def skip(self) -> tuple[int, int]:
-        """Index of the next entry, and where its data begin: the caller plays it."""
-        state, at = self._state, 4 + 16 * self._state.index
+        """Skip the next entry, which the caller plays. Return its index and its data's offset."""
+        state = self._state
+        at = 4 + 16 * state.index
         found = state.index, state.data_at
         state.index += 1
         state.data_at += int.from_bytes(self._payload[at + 12 : at + 16], "little")
         return found
 
     def play(self, last_ns: int) -> tuple[bool, int]:
-        """Play on. True at an entry that is the caller's; else the block ends, or there is no room. And the time of the last entry."""
+        """Play further entries. Return whether the next one is for the caller, and the last time.
+
+        If it is not, the block has ended, or there is no room.
+        """
         state = self._state
         state.last = last_ns
         why = self._library.kcg_play(c.byref(state), self._payload, len(self._payload))
@@ -125,7 +144,7 @@ class Player(Output):
     # --- plain bytes of one ESC
 
     def set_bytes(self, period_ns: int) -> None:
-        """Times: a live frame each ``period_ns``."""
+        """Prepare for plain bytes: they get a time for each live frame, every ``period_ns``."""
         layout = Layout("", "", ())
         self._finder = NativeCore(self._library, [self._settings], layout, 0, False)
         self._finder.state.mask = 0  # no events
@@ -133,7 +152,10 @@ class Player(Output):
         self._state.period = period_ns
 
     def play_bytes(self, data: bytes, begin: int, ended: bool) -> bool:
-        """The stream from ``begin`` on, which is not after ``position``. True where there was no room for all of it."""
+        """Play the stream from ``begin`` on, which is not after ``position``.
+
+        Return True if there was no room for all of it.
+        """
         state = self._state
         state.base = begin
         why = self._library.kcg_play_bytes(c.byref(state), data, len(data), ended)
@@ -142,44 +164,48 @@ class Player(Output):
 
     @property
     def position(self) -> int:
-        """Bytes that were played."""
+        """Number of bytes that were played."""
         return int(self._state.fed)
 
     @property
     def counters(self) -> Counters:
-        """Of what found the frames."""
+        """Counters of the core that finds the frames."""
         return self._finder.escs[0].counters
 
-    # --- what came of it
+    # --- results
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         self._library.kcg_row_event(c.byref(self._state), esc, events, now)
 
     def take_frames(self, final: bool = False) -> Frames:
-        """The frames that are sure: those of the last turn are only by the next entry, or because there is none (``final``)."""
+        """Return the frames that are certain.
+
+        Frames of the last turn are certain after the next entry, or with ``final`` (the end).
+        """
         state = self._state
         sure = state.count if final else state.sure
         if self._columns is not None or not sure:
             return Frames(FrameRoom(self._library, 0), 0, 0)
         taken, other = self._rooms
         taken.move_to(other, sure, state.count - sure)
-        state.count, state.sure = state.count - sure, 0
+        state.count -= sure
+        state.sure = 0
         self._rooms.reverse()
         self._set_room()
         return Frames(taken, 0, sure)
 
     @property
     def is_full(self) -> bool:
-        """True where rows must be taken before more is played."""
+        """True if rows must be taken before more can be played."""
         return bool(self._state.rows + KCG.MAX_ROWS > self._state.room)
 
     def rows_so_far(self) -> Rows:
-        """The rows that are complete. Later ones are appended to them, until ``take_rows``."""
+        """Return the complete rows. Later rows are appended to them, until ``take_rows``."""
         self._rows.count = self._state.rows
         return self._rows
 
     def take_rows(self, final: bool = False) -> Rows:
-        """The rows that are complete; ``final``: also the one that is open."""
+        """Return the complete rows, and with ``final`` also the row that is open."""
         if final:
             self._library.kcg_close_row(c.byref(self._state))
         found = self.rows_so_far()

@@ -1,4 +1,7 @@
-"""Factor and offset of a signal as numbers of the core in C, with the proof that no product leaves 64 bits."""
+"""Factor and offset of a signal as numbers of the core in C.
+
+It is proven for each signal that no product leaves 64 bits.
+"""
 
 import math
 import struct
@@ -39,7 +42,10 @@ _MAX_POWER = 330
 
 
 def set_scale(row: Any, signal: SignalPlan, value: Value) -> None:
-    """Fill in factor, offset and limits of a row. NotInCore, with a factor that fits, if a product can leave 64 bits."""
+    """Enter factor, offset and limits into a row.
+
+    Raises NotInCore if a product can leave 64 bits. The message names a factor that fits.
+    """
     if signal.is_float:
         set_one = _set_float_scale
         row.flags |= KCG.REAL

@@ -1,4 +1,4 @@
-"""Slots of the core in C (core.h, kcg_slot_start): their rows in its tables, and their interface."""
+"""Slots of the core in C (core.h, kcg_slot_start): their rows and their interface."""
 
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol

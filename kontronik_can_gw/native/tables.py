@@ -256,7 +256,7 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
 
 
 def places_of(protocol: EscProtocol) -> Places:
-    """Return offset and wire type of each word. Raises NotInCore if C cannot decode the protocol."""
+    """Return offset and type of each word. Raises NotInCore if C cannot decode the protocol."""
     if protocol.wire is None:
         raise NotInCore(f"ESC protocol {protocol.name}")
     found: Places = ([], [])

@@ -150,7 +150,9 @@ static int64_t clock_ns(void)
 /* Hook 2, the bus: returns 1 if a mailbox accepted the frame, 0 if no mailbox is free. */
 static int frame_out(const kcg_frame *frame)
 {
-    printf("(%lu.%06lu) can0 ", (unsigned long)(simulated / (1000 * MS)), (unsigned long)(simulated % (1000 * MS) / 1000));
+    unsigned long seconds = (unsigned long)(simulated / (1000 * MS));
+    unsigned long microseconds = (unsigned long)(simulated % (1000 * MS) / 1000);
+    printf("(%lu.%06lu) can0 ", seconds, microseconds);
     printf(frame->id >> 31 ? "%08lX#" : "%03lX#", (unsigned long)(frame->id & 0x1FFFFFFF));
     if (frame->flags)
         printf("#0");
