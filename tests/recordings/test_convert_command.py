@@ -89,7 +89,7 @@ def test_a_signal_leaves_no_incomplete_file(
 ) -> None:
     # the log is long enough for the signal to arrive before its end
     source = candump_log(tmp_path / "long.log", 100)
-    command = [*PROGRAM, source, tmp_path / "out", "--to", form]
+    command = [*PROGRAM, str(source), str(tmp_path / "out"), "--to", form]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     while process.poll() is None and not (tmp_path / "out.part").exists():
         time.sleep(0.001)

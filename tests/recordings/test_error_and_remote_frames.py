@@ -178,8 +178,8 @@ def test_error_objects_of_blf_that_python_can_skips_are_read(tmp_path: Path, kin
     found = _logged(path)
     kinds = [(item.kind, item.channel) for item in found]
     assert kinds == [("CAN frame", "2"), ("error frame", "2")] * 6
-    times = [round(item.time_ns / MS) for item in found]
-    assert times == [0, 1, 10, 11, 20, 21, 30, 31, 40, 41, 50, 51]
+    milliseconds = [round(item.time_ns / MS) for item in found]
+    assert milliseconds == [0, 1, 10, 11, 20, 21, 30, 31, 40, 41, 50, 51]
 
 
 def test_remote_frames_of_a_capture_are_remote_frames_in_a_log(tmp_path: Path) -> None:
