@@ -26,14 +26,10 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.times import MS
 
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
-KEYS: dict[str, dict[str, Any]] = {
-    table: {
-        key: entry
-        for key, entry in described.get("items", described)["properties"].items()
-        if "deprecated" not in entry
-    }
-    for table, described in schema()["properties"].items()
-}
+KEYS: dict[str, dict[str, Any]] = {}
+for _table, _described in schema()["properties"].items():
+    _entries = _described.get("items", _described)["properties"]
+    KEYS[_table] = {key: entry for key, entry in _entries.items() if "deprecated" not in entry}
 """The schema of each key. docs/reference/configuration.md is made from the same rows."""
 
 
@@ -52,7 +48,12 @@ def tables(table: str = "", key: str = "", value: object = None) -> dict[str, An
 def taken(table: str, key: str, value: object) -> Any:
     """Return the value in use for one key."""
     config = parse(tables(table, key, value), "a.toml")
-    return getattr(config.esc[0] if table == "esc" else getattr(config, table), key)
+    return getattr(table_of(config, table), key)
+
+
+def table_of(config: Config, table: str) -> Any:
+    """Return a table of the configuration, or the first ESC."""
+    return config.esc[0] if table == "esc" else getattr(config, table)
 
 
 def problems(given_tables: Any) -> list[str]:
@@ -72,7 +73,8 @@ def test_value_in_use_differs_from_the_value_written() -> None:
     for number in (1, 9.8, 0.001, 1000, 1e3):
         assert taken("esc", "gear", number) == Fraction(str(number))
     assert taken("dbc", "messages", ["Motor_*", "X"]) == ("Motor_*", "X")
-    assert parse(tables("esc", "telemetry_timeout_ms", 20), "a.toml").escs[0].timeout_ns == 20 * MS
+    config = parse(tables("esc", "telemetry_timeout_ms", 20), "a.toml")
+    assert config.escs[0].timeout_ns == 20 * MS
 
 
 @pytest.mark.parametrize(
@@ -88,7 +90,8 @@ def test_broker_has_the_usual_port_unless_it_is_given(
     text: str, host: str, plain: int, encrypted: int
 ) -> None:
     for tls, port in ((False, plain), (True, encrypted)):
-        made = parse({"mqtt": {"broker": text, "tls": tls}, "esc": [{"port": "x"}]}, "a.toml")
+        mqtt = {"broker": text, "tls": tls}
+        made = parse({"mqtt": mqtt, "esc": [{"port": "x"}]}, "a.toml")
         assert made.mqtt.address == (host, port)
     assert parse(tables(), "a.toml").mqtt.address is None
 
@@ -126,17 +129,39 @@ def escs(*entries: dict[str, Any]) -> dict[str, Any]:
     return {"esc": [{"port": f"p{n}"} | entry for n, entry in enumerate(entries)]}
 
 
-DBC = 'VERSION ""\nNS_ :\nBS_:\nBU_: Gateway\nBO_ 256 M: 8 Gateway\n SG_ BattVolt : 0|16@1+ (1,0) [0|0] "V" Gateway\n'
+DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: Gateway
+BO_ 256 M: 8 Gateway
+ SG_ BattVolt : 0|16@1+ (1,0) [0|0] "V" Gateway
+"""
 BAD_DBC = "M.BattVolt: no such source"
+TWO_ON_ONE_PORT = [{"port": "a"}, {"port": "a"}]
 OTHERS: list[tuple[dict[str, Any], list[str]]] = [
-    ({"statistics": {"file": "my.dbc"}} | escs({"name": "x"}, {"name": "X"}),
-     ["esc[2].name: 'X' is also", "statistics.file", BAD_DBC]),
-    ({"canopen": {"node_id": 127, "eds": "none.eds"}, "esc": [{"port": "a"}] * 2},
-     ["esc[2].port", "esc[2]: its node-ID would be 128", "none.eds: cannot be read", BAD_DBC]),
-    ({"can": {"channel": "/dev/null"}, "esc": [{"port": "/dev/null"}]}, ["is the port of esc1", BAD_DBC]),
-    # The rest depends on the tables.
-    ({"dbc": {"file": "my.dbc", "noode": 1}, "esc": [{"port": "a"}] * 2}, ["noode", "esc[2].port"]),
-]  # fmt: skip
+    (
+        {"statistics": {"file": "my.dbc"}} | escs({"name": "x"}, {"name": "X"}),
+        ["esc[2].name: 'X' is also", "statistics.file", BAD_DBC],
+    ),
+    (
+        {"canopen": {"node_id": 127, "eds": "none.eds"}, "esc": TWO_ON_ONE_PORT},
+        [
+            "esc[2].port",
+            "esc[2]: its node-ID would be 128",
+            "none.eds: cannot be read",
+            BAD_DBC,
+        ],
+    ),
+    (
+        {"can": {"channel": "/dev/null"}, "esc": [{"port": "/dev/null"}]},
+        ["is the port of esc1", BAD_DBC],
+    ),
+    # The DBC depends on the tables, so with a mistake in a table it is not checked.
+    (
+        {"dbc": {"file": "my.dbc", "noode": 1}, "esc": TWO_ON_ONE_PORT},
+        ["noode", "esc[2].port"],
+    ),
+]
 
 
 @pytest.mark.parametrize(("made", "expected"), OTHERS)
@@ -147,9 +172,13 @@ def test_mistakes_of_every_file_are_reported_together(
     tables = {"dbc": {"file": "my.dbc"}} | made
     if "canopen" in tables:
         tables["canopen"]["enabled"] = True
-    lines = [f"[{n}]\n{rows_of(table)}" for n, table in tables.items() if n != "esc"]
-    lines += [f"[[esc]]\n{rows_of(esc)}" for esc in tables["esc"]]
-    (tmp_path / "a.toml").write_text("".join(lines))
+    text = ""
+    for name, table in tables.items():
+        if name != "esc":
+            text += f"[{name}]\n{rows_of(table)}"
+    for esc in tables["esc"]:
+        text += f"[[esc]]\n{rows_of(esc)}"
+    (tmp_path / "a.toml").write_text(text)
     with pytest.raises(UserError) as caught:
         load_configuration(tmp_path / "a.toml")
     assert caught.value.exit_code == 2
@@ -178,14 +207,18 @@ def test_removed_key_is_a_warning_with_place_and_replacement(
         "a.toml: can.queue: was removed and is ignored. Leave it out.",
         "a.toml: esc[2].motor: was removed and is ignored. Give pole_pairs.",
     )
-    assert (config.can.channel, config.esc[1].gear) == ("can1", Fraction(2))
-    assert config.can == parse({"can": {"channel": "can1"}} | escs({}), "a.toml").can
+    assert config.can.channel == "can1"
+    assert config.esc[1].gear == Fraction(2)
+    without = parse({"can": {"channel": "can1"}} | escs({}), "a.toml")
+    assert config.can == without.can
     assert jsonschema.Draft202012Validator(schema()).is_valid(old)
     assert "queue" not in as_toml(config)
     assert problems(old | {"run": 1}) == ["a.toml: run: is a table, written [run]"]
     for key, advice in REMOVED_KEYS.items():
         table, _, name = key.partition(".")
-        assert table in KEYS and name not in KEYS[table] and advice.endswith("."), key
+        assert table in KEYS, key
+        assert name not in KEYS[table], key
+        assert advice.endswith("."), key
 
 
 # --- the shipped example
@@ -206,8 +239,10 @@ def test_shipped_example_is_valid_and_has_every_key(tmp_path: Path) -> None:
     assert [esc.name for esc in load(windows).esc] == ["esc1", "right"]
     made = tomllib.loads(text)
     for table, keys in KEYS.items():
-        given = made["esc"] if table == "esc" else [made[table]]
-        assert {key for entry in given for key in entry} == set(keys)
+        given: set[str] = set()
+        for entry in made["esc"] if table == "esc" else [made[table]]:
+            given |= entry.keys()
+        assert given == set(keys)
     assert set(KEYS) == set(made)
 
 
@@ -260,17 +295,19 @@ TAKEN: dict[tuple[str, str], list[Any]] = {
 
 def given(table: str, key: str) -> list[tuple[bool | None, Any]]:
     """Return values of a key, and whether they are accepted. None: the schema decides."""
-    values: list[Any] = [
-        *(0, 1, -1, 7, 127, 128, 200, 10_000, 10**30, 0.0005, 0.001, 0.5, 9.8, 1000.5, -0.5),
-        *("", " ", "x", "1/3", "98/10", "9.8/2", " 1/3", "1 / 3", "1e1", ".5", "+1", "-1", "٣"),
-        *("a b", "1a", "A234567890123", "max", True, False, [], [1], {}),
-    ]
+    numbers = [0, 1, -1, 7, 127, 128, 200, 10_000, 10**30]
+    fractions = [0.0005, 0.001, 0.5, 9.8, 1000.5, -0.5]
+    texts = ["", " ", "x", "a b", "1a", "A234567890123", "max"]
+    ratios = ["1/3", "98/10", "9.8/2", " 1/3", "1 / 3", "1e1", ".5", "+1", "-1", "٣"]
+    others: list[Any] = [True, False, [], [1], {}]
     entries: list[Any] = [1, "x", "", True, 1.5, -1, 65_535, 65_536, {}, []]
-    inner: list[Any] = [1, "x", {"c": 1}, []]
-    values += [{"a": entry} for entry in (*entries, *({"b": each} for each in inner))]
+    entries += [{"b": 1}, {"b": "x"}, {"b": {"c": 1}}, {"b": []}]
+    values: list[Any] = [*numbers, *fractions, *texts, *ratios, *others]
+    values += [{"a": entry} for entry in entries]
     found: list[tuple[bool | None, Any]] = [(None, value) for value in values]
     entry = KEYS[table].get(key, {})
-    found += [(True, value) for value in (*entry.get("enum", ()), *TAKEN.get((table, key), ()))]
+    found += [(True, value) for value in entry.get("enum", ())]
+    found += [(True, value) for value in TAKEN.get((table, key), ())]
     if "minimum" in entry:
         low, high = entry["minimum"], entry["maximum"]
         found += [(True, low), (True, high), (False, low - 1), (False, high + 1)]
@@ -289,14 +326,20 @@ def test_schema_and_parser_accept_the_same_and_toml_is_equal() -> None:
                 if place != "esc.name = 'max'":
                     assert VALIDATOR.is_valid(made) == (config is not None), place
                 if config is not None:
-                    in_table = config.esc[0] if table == "esc" else getattr(config, table)
-                    found = getattr(in_table, key)
+                    found = getattr(table_of(config, table), key)
                     if key not in ("gear", "messages", "bind"):  # their values change in use
-                        assert found == value and type(found) is type(value), place
+                        assert found == value, place
+                        assert type(found) is type(value), place
                     check_toml(config)
-    kinds: list[Any] = [{}, [], 1, "x", [{}], [1], [{"port": "a"}, {"port": "b"}], [{}, {}]]
-    for made in (tables() | {table: kind} for table in (*KEYS, "x") for kind in kinds):
-        assert VALIDATOR.is_valid(made) == (accepted(made) is not None), made
+
+
+def test_schema_and_parser_accept_the_same_kinds_of_tables() -> None:
+    two_escs = [{"port": "a"}, {"port": "b"}]
+    kinds: list[Any] = [{}, [], 1, "x", [{}], [1], two_escs, [{}, {}]]
+    for table in (*KEYS, "x"):
+        for kind in kinds:
+            made = tables() | {table: kind}
+            assert VALIDATOR.is_valid(made) == (accepted(made) is not None), made
 
 
 def check_toml(config: Config) -> None:
@@ -309,10 +352,17 @@ def check_toml(config: Config) -> None:
 def test_any_text_can_be_written_as_toml() -> None:
     odd = ('a"b', "C:\\x", "a\nb", "\t\x01\x1f\x7f\x85", "ü€😀", "'''", '"""', "#", "a = [b]")
     for text in odd:
-        made = {"bind": {text: text}, "file": text, "units": {text: "V"}, "e2e_data_ids": {text: 1}}
-        check_toml(
-            parse({"esc": [{"port": text}], "dbc": made, "can": {"options": {text: text}}}, text)
-        )
+        made = {
+            "esc": [{"port": text}],
+            "can": {"options": {text: text}},
+            "dbc": {
+                "bind": {text: text},
+                "file": text,
+                "units": {text: "V"},
+                "e2e_data_ids": {text: 1},
+            },
+        }
+        check_toml(parse(made, text))
     check_toml(load(EXAMPLE))
     check_toml(parse(tomllib.loads(uncommented()), str(EXAMPLE)))
 

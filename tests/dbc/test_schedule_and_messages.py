@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import pytest
 from dbc_bench import compiled
@@ -116,57 +117,137 @@ def every(first: int, last: int, step: int, number: int) -> str:
 
 
 NONE = 65535
-SCENES: list[tuple[str, int, int, int, str, list[tuple[int, int]]]] = [
-    ("a cyclic message is not sent on events", CYCLIC, 1000, 0, every(10, 500, 10, 7), [(0, NONE)]),
-    ("an event message is sent with each live frame and no other", EVENT, 0, 0,
-     "10 live 1, 10 info, 20 live 2, 20 info, 30 live 3, 40", [(10, 1), (20, 2), (30, 3)]),
-    ("events closer than the minimum distance are put off and send the newest value", EVENT, 0, 25,
-     "3 live 1, 6 live 2, 9 live 3, 10 live 7, 100", [(3, 1), (28, 7)]),
-    # the runtime reads the port before the clock
-    ("one event sends one frame even if another was put off before", EVENT, 0, 5,
-     "=10 live 1, 13 live 2, =16 live 3, 200", [(10, 1), (16, 3)]),
-    ("a cycle and an event that was put off send one frame", CYCLIC_AND_EVENT, 12, 5,
-     "7 live 1, 9 live 2, 23", [(0, NONE), (7, 1), (12, 2)]),
-    ("a change that is undone while it is put off is not sent", ON_CHANGE, 0, 25,
-     "10 live 1, 20 live 2, 30 live 1, 200", [(10, 1)]),
-    ("an on-change message is sent only when a raw value changes", ON_CHANGE, 0, 0,
-     "10 live 1, 20 live 1, 30 live 2, 40 live 2, 50 live 1, 60 live 1",
-     [(10, 1), (30, 2), (50, 1)]),
-    ("the newest of several frames in one read is sent", EVENT, 0, 0,
-     "10 live 10 11 12, 20 live 20 21 22", [(10, 12), (20, 22)]),
-    ("a late call sends one frame and the grid of cycles does not move", CYCLIC, 100, 0,
-     "0, =101 look, =101 look, =150 look, =1010 look, =1010 look, 1200",
-     [(0, NONE), (101, NONE), (1010, NONE), (1100, NONE), (1200, NONE)]),
-    ("cyclic and event sends on both", CYCLIC_AND_EVENT, 100, 0,
-     "50 live 1, 120 live 2, 210", [(0, NONE), (50, 1), (100, 1), (120, 2), (200, 2)]),
-    ("cyclic and on change sends on both", CYCLIC_AND_ON_CHANGE, 100, 10,
-     f"5 live 1, {every(15, 95, 10, 1)}, {every(105, 305, 10, 2)}",
-     [(0, NONE), (10, 1), (100, 1), (110, 2), (200, 2), (300, 2)]),
-    ("a cycle that the minimum distance puts off is not lost", CYCLIC_AND_ON_CHANGE, 100, 30,
-     "90 live 1, 180, =190 live 2, 299", [(0, NONE), (90, 1), (120, 1), (190, 2), (220, 2)]),
-    ("a loss sends an event message once", EVENT, 0, 100,
-     "50 live 5, 55 live 6, 5000", [(50, 5), (150, 6), (305, NONE)]),
-    ("a loss sends an on-change message once", ON_CHANGE, 0, 0,
-     "50 live 5, 60 live 5, 5000", [(50, 5), (310, NONE)]),
-    ("a lost port is a loss at once", EVENT, 0, 0,
-     "10 live 1, 20 live 2, 23 lost, 2000", [(10, 1), (20, 2), (23, NONE)]),
-]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("kind", "cycle", "delay", "steps", "sent"),
-    [pytest.param(*row, id=title) for title, *row in SCENES],
-)
-def test_scene_sends_these_values_at_these_times(
-    kind: int, cycle: int, delay: int, steps: str, sent: list[tuple[int, int]]
-) -> None:
-    """Play a scene.
+class Scene(NamedTuple):
+    """Events of an ESC with one message, and the frames sent.
 
-    With ``=`` before a time, the gateway is not called until then. The numbers after ``live`` are
-    the voltages of the frames in one read.
+    ``cycle`` and ``delay`` are the cycle and the minimum distance in ms. ``steps`` has the events,
+    each with its time in ms. With ``=`` before a time, the gateway is not called until then. The
+    numbers after ``live`` are the voltages of the frames in one read. ``sent`` has the times and
+    the voltages of the frames.
     """
-    bench = lone(kind, cycle, delay, Sig("AliveCounter", 16, 4))
-    for step in steps.split(", "):
+
+    title: str
+    kind: int
+    steps: str
+    sent: list[tuple[int, int]]
+    cycle: int = 0
+    delay: int = 0
+
+
+SCENES = [
+    Scene(
+        "a cyclic message is not sent on events",
+        CYCLIC,
+        every(10, 500, 10, 7),
+        [(0, NONE)],
+        cycle=1000,
+    ),
+    Scene(
+        "an event message is sent with each live frame and no other",
+        EVENT,
+        "10 live 1, 10 info, 20 live 2, 20 info, 30 live 3, 40",
+        [(10, 1), (20, 2), (30, 3)],
+    ),
+    Scene(
+        "events closer than the minimum distance are put off and send the newest value",
+        EVENT,
+        "3 live 1, 6 live 2, 9 live 3, 10 live 7, 100",
+        [(3, 1), (28, 7)],
+        delay=25,
+    ),
+    # the runtime reads the port before the clock
+    Scene(
+        "one event sends one frame even if another was put off before",
+        EVENT,
+        "=10 live 1, 13 live 2, =16 live 3, 200",
+        [(10, 1), (16, 3)],
+        delay=5,
+    ),
+    Scene(
+        "a cycle and an event that was put off send one frame",
+        CYCLIC_AND_EVENT,
+        "7 live 1, 9 live 2, 23",
+        [(0, NONE), (7, 1), (12, 2)],
+        cycle=12,
+        delay=5,
+    ),
+    Scene(
+        "a change that is undone while it is put off is not sent",
+        ON_CHANGE,
+        "10 live 1, 20 live 2, 30 live 1, 200",
+        [(10, 1)],
+        delay=25,
+    ),
+    Scene(
+        "an on-change message is sent only when a raw value changes",
+        ON_CHANGE,
+        "10 live 1, 20 live 1, 30 live 2, 40 live 2, 50 live 1, 60 live 1",
+        [(10, 1), (30, 2), (50, 1)],
+    ),
+    Scene(
+        "the newest of several frames in one read is sent",
+        EVENT,
+        "10 live 10 11 12, 20 live 20 21 22",
+        [(10, 12), (20, 22)],
+    ),
+    Scene(
+        "a late call sends one frame and the grid of cycles does not move",
+        CYCLIC,
+        "0, =101 look, =101 look, =150 look, =1010 look, =1010 look, 1200",
+        [(0, NONE), (101, NONE), (1010, NONE), (1100, NONE), (1200, NONE)],
+        cycle=100,
+    ),
+    Scene(
+        "cyclic and event sends on both",
+        CYCLIC_AND_EVENT,
+        "50 live 1, 120 live 2, 210",
+        [(0, NONE), (50, 1), (100, 1), (120, 2), (200, 2)],
+        cycle=100,
+    ),
+    Scene(
+        "cyclic and on change sends on both",
+        CYCLIC_AND_ON_CHANGE,
+        f"5 live 1, {every(15, 95, 10, 1)}, {every(105, 305, 10, 2)}",
+        [(0, NONE), (10, 1), (100, 1), (110, 2), (200, 2), (300, 2)],
+        cycle=100,
+        delay=10,
+    ),
+    Scene(
+        "a cycle that the minimum distance puts off is not lost",
+        CYCLIC_AND_ON_CHANGE,
+        "90 live 1, 180, =190 live 2, 299",
+        [(0, NONE), (90, 1), (120, 1), (190, 2), (220, 2)],
+        cycle=100,
+        delay=30,
+    ),
+    Scene(
+        "a loss sends an event message once",
+        EVENT,
+        "50 live 5, 55 live 6, 5000",
+        [(50, 5), (150, 6), (305, NONE)],
+        delay=100,
+    ),
+    Scene(
+        "a loss sends an on-change message once",
+        ON_CHANGE,
+        "50 live 5, 60 live 5, 5000",
+        [(50, 5), (310, NONE)],
+    ),
+    Scene(
+        "a lost port is a loss at once",
+        EVENT,
+        "10 live 1, 20 live 2, 23 lost, 2000",
+        [(10, 1), (20, 2), (23, NONE)],
+    ),
+]
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.title)
+def test_scene_sends_these_values_at_these_times(scene: Scene) -> None:
+    bench = lone(scene.kind, scene.cycle, scene.delay, Sig("AliveCounter", 16, 4))
+    for step in scene.steps.split(", "):
         at, *what = step.split()
         if at.startswith("="):
             bench.now = int(at[1:]) * MS
@@ -183,15 +264,20 @@ def test_scene_sends_these_values_at_these_times(
             case ["lost"]:
                 bench.gateway.port(0, False, bench.now)
                 bench.take()
-    assert list(zip(bench.times(), bench.raws(), strict=True)) == sent
-    assert bench.raws(4, 16) == [number % 16 for number in range(len(sent))]
+    assert list(zip(bench.times(), bench.raws(), strict=True)) == scene.sent
+    assert bench.raws(4, 16) == [number % 16 for number in range(len(scene.sent))]
 
 
 # --- one step
 
 
 def test_due_messages_are_sent_by_due_time_and_then_by_index() -> None:
-    ids = {0x100: (EVENT, 0), 0x101: (CYCLIC, 20), 0x102: (EVENT, 0), 0x103: (CYCLIC, 50)}
+    ids = {
+        0x100: (EVENT, 0),
+        0x101: (CYCLIC, 20),
+        0x102: (EVENT, 0),
+        0x103: (CYCLIC, 50),
+    }
     messages = []
     for can_id, (kind, cycle) in ids.items():
         message = Msg(f"EscPower{can_id}", can_id, 8, [VOLTAGE])

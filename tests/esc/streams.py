@@ -32,9 +32,8 @@ def overlapping_pair(first: FormRow, second: FormRow, shared: int, source: rando
     body[start - 4 : start] = second.header
     outer = seal(first, bytes(body))
     inner_begin = outer[start + 4 :]
-    return outer[:start] + seal(
-        second, inner_begin + source.randbytes(second.crc_at - 4 - len(inner_begin))
-    )
+    rest = source.randbytes(second.crc_at - 4 - len(inner_begin))
+    return outer[:start] + seal(second, inner_begin + rest)
 
 
 def random_piece(source: random.Random) -> bytes:
@@ -52,15 +51,14 @@ def random_piece(source: random.Random) -> bytes:
         cut = source.randrange(1, len(frame))
         return source.choice([frame[:cut], frame[cut:]])
     if choice == 9:  # a whole frame after a false header
-        return source.choice([b"KODL", b"KODI"]) + source.randbytes(source.randrange(0, 40)) + frame
+        header = source.choice([b"KODL", b"KODI"])
+        return header + source.randbytes(source.randrange(0, 40)) + frame
     if choice == 10:  # headers in a row
         return source.choice([b"KODL", b"KODI", b"KOD"]) * source.randrange(1, 12)
     if choice == 11:
         shared = source.randrange(8, 32)
-        first = source.choice(
-            [row for row in FORM_ROWS if 4 <= row.length - shared <= row.covered - 4]
-        )
-        return overlapping_pair(first, row, shared, source)
+        fitting = [row for row in FORM_ROWS if 4 <= row.length - shared <= row.covered - 4]
+        return overlapping_pair(source.choice(fitting), row, shared, source)
     if choice == 12:
         return source.randbytes(source.randrange(0, 60))
     if choice == 13:  # fragments as a frame's content
@@ -68,7 +66,8 @@ def random_piece(source: random.Random) -> bytes:
         return seal(row, content.ljust(40, b"K")[: row.crc_at - 4])
     if choice == 14:  # one bad bit
         at = source.randrange(len(frame))
-        return frame[:at] + bytes([frame[at] ^ 1 << source.randrange(8)]) + frame[at + 1 :]
+        wrong = frame[at] ^ 1 << source.randrange(8)
+        return frame[:at] + bytes([wrong]) + frame[at + 1 :]
     return source.choice(FRAGMENTS)
 
 

@@ -32,7 +32,9 @@ esc = [{"port": "/dev/null"}, {"port": "/dev/zero"}]
 config = parse({"can": {"interface": "virtual", "channel": "x"}, "esc": esc}, "x.toml")
 gateway = Gateway(config.escs, assemble(config).layout, 0, outputs=[shipped_canopen([1, 2])])
 gateway.start(0)
-escs = [SimulatedEsc(EscOptions(device=device, layout=Layout.V4), seed=device) for device in (Device.KOSMIK, Device.JIVEPRO)]
+escs = []
+for device in (Device.KOSMIK, Device.JIVEPRO):
+    escs.append(SimulatedEsc(EscOptions(device=device, layout=Layout.V4), seed=device))
 frames = []
 for now in range(0, 3_000_000_000, 10_000_000):
     for index, esc in enumerate(escs):

@@ -82,7 +82,8 @@ class Flight:
 
 
 FRAME = frame(20, 2_400, 1_234, 55, 210)
-OLD = encode(LiveData(electrical_speed=9_000, battery_voltage=2_500, battery_current=-5), Layout.V4)
+OLD_LIVE = LiveData(electrical_speed=9_000, battery_voltage=2_500, battery_current=-5)
+OLD = encode(OLD_LIVE, Layout.V4)
 
 
 def test_values_of_both_protocols_are_sent() -> None:
@@ -113,13 +114,13 @@ def test_values_of_both_protocols_are_sent() -> None:
 def test_missing_flag_is_not_read_as_no_error() -> None:
     loaded = Flight().loaded
     reader = SignalReader(loaded.layout)
-    column = [(each.source, each.esc) for each in reader.columns].index(("undervoltage", 1))
+    columns = [(each.source, each.esc) for each in reader.columns]
+    column = columns.index(("undervoltage", 1))
     first, values = (reader.read(258, bytes(8)) or [])[0]
     assert values[column - first] is None
     (warning,) = [line for line in loaded.warnings if "not supplied by" in line]
-    assert (
-        "KissMore: KissBecVoltage, KissUndervoltage: not supplied by the protocol kiss" in warning
-    )
+    words = "KissMore: KissBecVoltage, KissUndervoltage: not supplied by the protocol kiss"
+    assert words in warning
 
 
 @pytest.mark.parametrize(
@@ -150,12 +151,13 @@ def test_node_status_and_tables_show_only_supplied_values() -> None:
     port = PortFacts("kiss", "/dev/zero", open=True)
     document = _esc(esc, port, gateway.status, flight.now)
     assert document["counters"]["live"] == 1
-    assert (document["operating_state"], document["errors"], document["device"]) == (None,) * 3
-    live = {
-        field.source: field.reader(esc, gateway.status, flight.now)
-        for field in fields_of_values([each.settings for each in gateway.escs])
-        if field.esc == 1 and VALUES[field.source].group is Group.LIVE
-    }
+    assert document["operating_state"] is None
+    assert document["errors"] is None
+    assert document["device"] is None
+    live = {}
+    for field in fields_of_values([each.settings for each in gateway.escs]):
+        if field.esc == 1 and VALUES[field.source].group is Group.LIVE:
+            live[field.source] = field.reader(esc, gateway.status, flight.now)
     values = there(document["values"])
     assert there(live).items() <= values.items()
     assert there(live) == {
@@ -181,13 +183,16 @@ def test_a_capture_names_the_protocol() -> None:
     setup = CaptureSetup(escs, ("a", "b"), None, DbcConfig(), False)
     assert CaptureSetup.of(setup.header()).escs == escs
     old: Any = setup.header()
-    old["escs"] = [{k: v for k, v in esc.items() if k != "protocol"} for esc in old["escs"]]
+    for esc in old["escs"]:
+        del esc["protocol"]
     assert [esc.protocol for esc in CaptureSetup.of(old).escs] == ["kontronik", "kontronik"]
 
 
 def test_line_is_set_without_parity() -> None:
     with PtyEsc() as esc, closing(SerialPort(esc.path, KISS)) as port:
-        flags, speed = (termios.tcgetattr(port.fileno())[at] for at in (2, 4))
+        settings = termios.tcgetattr(port.fileno())
+    flags = settings[2]
+    speed = settings[4]
     assert not flags & termios.PARENB
     assert speed == termios.B115200
 

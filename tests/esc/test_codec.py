@@ -54,8 +54,9 @@ form_rows = pytest.mark.parametrize("row", FORM_ROWS, ids=lambda row: f"{row.kin
 
 
 def fields_of(row: FormRow) -> tuple[DataType, list[Field]]:
-    live = row.kind == "live"
-    return (LiveData, sheet.LIVE_FIELDS) if live else (InfoData, sheet.INFO_FIELDS)
+    if row.kind == "live":
+        return LiveData, sheet.LIVE_FIELDS
+    return InfoData, sheet.INFO_FIELDS
 
 
 def frame_in(wire: bytes) -> Frame:
@@ -68,7 +69,9 @@ def frame_in(wire: bytes) -> Frame:
 @pytest.mark.parametrize(("wire", "data"), RECORDED.items(), ids=["live", "info"])
 def test_recorded_frame_has_the_stated_values(wire: bytes, data: Data) -> None:
     found = frame_in(wire)
-    assert (found.layout, type(found.data), found.data) == (Layout.LEGACY, type(data), data)
+    assert found.layout == Layout.LEGACY
+    assert type(found.data) is type(data)
+    assert found.data == data
     assert encode(data, Layout.LEGACY) == wire
 
 
@@ -82,15 +85,17 @@ def test_raw_values_survive_a_round_trip_with_any_reserved_bytes(
     ranges = [st.integers(*sheet.TYPE_RANGES[field.code]) for field in fields]
     data = data_type(*choice.draw(st.tuples(*ranges)))
     size = row.crc_at - row.body_end
-    body = b"".join(struct.pack("<" + f.code, getattr(data, f.name)) for f in fields)
+    body = b""
+    for field in fields:
+        body += struct.pack("<" + field.code, getattr(data, field.name))
     sent = encode(data, Layout(row.layout))
     assert sent == reference.seal(row, body + bytes(size))
     assert frame_in(sent).form is form_of(row)
     for field in fields:
-        assert sent.startswith(
-            struct.pack("<" + field.code, getattr(data, field.name)), field.offset
-        )
-    other = reference.seal(row, body + choice.draw(st.binary(min_size=size, max_size=size)))
+        packed = struct.pack("<" + field.code, getattr(data, field.name))
+        assert sent.startswith(packed, field.offset)
+    reserved = choice.draw(st.binary(min_size=size, max_size=size))
+    other = reference.seal(row, body + reserved)
     assert frame_in(other).data == frame_in(sent).data == data
 
 
@@ -116,10 +121,13 @@ def test_changed_unprotected_byte_is_delivered_and_maybe_suspect(
 def test_field_has_type_unit_step_and_absence_of_the_sheet() -> None:
     for data, fields in ((LiveData, sheet.LIVE_FIELDS), (InfoData, sheet.INFO_FIELDS)):
         for (name, row), field in zip(rows(data).items(), fields, strict=True):
-            found = name, row.wire, row.unit, row.per_unit, row.type_range
-            limits = sheet.TYPE_RANGES[field.code]
-            assert found == (field.name, field.code, field.unit, field.steps, limits)
-            assert row.not_on == ({3} if name in ("bec_current", "max_bec_current") else set())
+            assert name == field.name
+            assert row.wire == field.code
+            assert row.unit == field.unit
+            assert row.per_unit == field.steps
+            assert row.type_range == sheet.TYPE_RANGES[field.code]
+            is_bec_current = name in ("bec_current", "max_bec_current")
+            assert row.not_on == ({3} if is_bec_current else set())
 
 
 def test_devices_and_states_have_exactly_the_names_of_the_sheet() -> None:
@@ -140,7 +148,8 @@ def test_error_bit_has_the_meaning_of_the_sheet(names: type[ErrorBit], bits: lis
         assert found.value == bit.number
         assert [word for word in bit.words if word not in text] == []
         assert bit.severity in (None, found.severity.value)
-        assert found.remedy.endswith(".") and found.remedy != found.meaning
+        assert found.remedy.endswith(".")
+        assert found.remedy != found.meaning
         assert KONTRONIK.bits[found.text] is found
     texts = [bit.text for bit in names] + [f"bit{number}" for number in range(len(names), 32)]
     assert bit_texts(0xFFFFFFFF, names) == texts
@@ -150,7 +159,7 @@ def test_parts_of_a_word_are_read_separately_and_written_together() -> None:
     for device, variant, word in ((3, 120, 0x0C78), (63, 1023, 0xFFFF), (1, 0, 0x400)):
         assert device_and_variant(device, variant) == word
         info = InfoData(device_and_variant=word)
-        found = [KONTRONIK.value(name, info) for name in ("device_raw", "variant")]
-        assert found == [device, variant]
+        assert KONTRONIK.value("device_raw", info) == device
+        assert KONTRONIK.value("variant", info) == variant
     for word, text in ((0x010E, "1.14"), (0x0300, "3.0"), (0xFFFF, "255.255")):
         assert KONTRONIK.firmware_text(InfoData(firmware_word=word)) == text

@@ -95,7 +95,8 @@ def test_frames_are_those_of_the_brute_force_search_in_any_chunks(stream: bytes,
 def test_state_at_every_moment_depends_on_the_bytes_alone(stream: bytes, seed: int) -> None:
     """A frame is returned as soon as it is certain. Counters do not depend on the chunks."""
     by_byte = Deframer()
-    states, moments = [state_of(by_byte)], []
+    states = [state_of(by_byte)]
+    moments = []
     for number, byte in enumerate(one_by_one(stream), start=1):
         moments += [number] * len(by_byte.feed(byte))
         states.append(state_of(by_byte))
@@ -129,7 +130,8 @@ def test_deframer_is_like_new_after_flush(parts: list[bytes], seed: int) -> None
             assert moved(deframer.feed(chunk)) == fresh.feed(chunk)
             assert deframer.pending == fresh.pending
         assert moved(deframer.flush()) == fresh.flush()
-        total = {name: total[name] + value for name, value in fresh.counters.as_dict().items()}
+        for name, value in fresh.counters.as_dict().items():
+            total[name] += value
         assert state_of(deframer) == (total, 0)
         base += len(part)
 
@@ -138,7 +140,15 @@ def test_deframer_is_like_new_after_flush(parts: list[bytes], seed: int) -> None
 
 SIZE = 1 << 16
 HOSTILE = (
-    *(b"KOD", b"KODL", b"KODI", b"KODLKODI", b"K", b"KO", b"\0", b"\xff", b"KODI" + bytes(39)),
+    b"KOD",
+    b"KODL",
+    b"KODI",
+    b"KODLKODI",
+    b"K",
+    b"KO",
+    b"\0",
+    b"\xff",
+    b"KODI" + bytes(39),
     random.Random(16).randbytes(SIZE),
 )
 
@@ -158,7 +168,8 @@ def test_work_on_hostile_input_is_linear(
     work = []
     for size in (SIZE // 4, SIZE):
         calculated.clear()
-        frames, _ = run(cut((unit * (size // len(unit) + 1))[:size]))
+        repeated = unit * (size // len(unit) + 1)
+        frames, _ = run(cut(repeated[:size]))
         assert not frames
         work.append((len(calculated), sum(calculated)))
     (calls, crc_bytes), (more_calls, more_bytes) = work
@@ -179,17 +190,54 @@ _BARE = sheet.RECORDED_LIVE[:34]
 LONGER = _BARE + zlib.crc32(_BARE).to_bytes(4, "little")
 DIAGNOSES: list[tuple[str, list[bytes]]] = [
     ("no bytes: ", [b""]),
-    ("bytes but never KOD: ", [noise_without_kod(size) for size in (1, 63, 64, 1000)]),
-    ("bytes but never KOD: ", [bytes(63), b"\xfe" * 899 + b"J" * 101]),
-    ("bytes but never KOD, in long runs", [bytes(64), b"\xfe" * 900 + b"J" * 100]),
-    ("headers but no valid CRC: ", [BAD * 5, b"KODX" + noise_without_kod(500) + BAD * 5]),
+    (
+        "bytes but never KOD: ",
+        [
+            noise_without_kod(1),
+            noise_without_kod(63),
+            noise_without_kod(64),
+            noise_without_kod(1000),
+        ],
+    ),
+    (
+        "bytes but never KOD: ",
+        [
+            bytes(63),
+            b"\xfe" * 899 + b"J" * 101,
+        ],
+    ),
+    (
+        "bytes but never KOD, in long runs",
+        [
+            bytes(64),
+            b"\xfe" * 900 + b"J" * 100,
+        ],
+    ),
+    (
+        "headers but no valid CRC: ",
+        [
+            BAD * 5,
+            b"KODX" + noise_without_kod(500) + BAD * 5,
+        ],
+    ),
     (
         "live frames of 38 bytes whose CRC covers 34 bytes",
-        [LONGER * 3, BAD * 3 + LONGER * 2 + bytes(8)],
+        [
+            LONGER * 3,
+            BAD * 3 + LONGER * 2 + bytes(8),
+        ],
     ),
     ("KOD frames of unknown kind", [(b"KODX" + bytes(36)) * 10]),
-    ("a header but no whole frame yet", [sheet.RECORDED_LIVE[:size] for size in (4, 20, 30, 37)]),
-    ("a header but no whole frame yet", [noise_without_kod(10) + sheet.RECORDED_LIVE[:4]]),
+    (
+        "a header but no whole frame yet",
+        [
+            sheet.RECORDED_LIVE[:4],
+            sheet.RECORDED_LIVE[:20],
+            sheet.RECORDED_LIVE[:30],
+            sheet.RECORDED_LIVE[:37],
+            noise_without_kod(10) + sheet.RECORDED_LIVE[:4],
+        ],
+    ),
 ]
 BEFORE = (
     b"",

@@ -33,12 +33,17 @@ S = 1_000_000_000
 
 def received(frames: list[Sent]) -> list[Frame]:
     deframer = Deframer()
-    return deframer.feed(b"".join(sent.wire for sent in frames)) + deframer.flush()
+    wire = b"".join(sent.wire for sent in frames)
+    return deframer.feed(wire) + deframer.flush()
 
 
 phases = st.builds(
-    *(Phase, st.just("any"), st.floats(0.001, 50), st.integers(-100, 100)),
-    *(st.sampled_from(OperatingState), st.floats(0, 20)),
+    Phase,
+    st.just("any"),
+    st.floats(0.001, 50),
+    st.integers(-100, 100),
+    st.sampled_from(OperatingState),
+    st.floats(0, 20),
 )
 any_options = st.builds(
     EscOptions,
@@ -67,7 +72,7 @@ def test_same_seed_gives_same_bytes_for_any_spacing_of_calls(cuts: list[int], se
     esc = SimulatedEsc(options, seed=seed)
     pieces = [esc.frames_until(cut) for cut in [*sorted(cuts), 20 * S]]
     whole = SimulatedEsc(options, seed=seed).frames_until(20 * S)
-    assert [*itertools.chain.from_iterable(pieces)] == whole
+    assert list(itertools.chain.from_iterable(pieces)) == whole
 
 
 @pytest.mark.parametrize("device", Device)
@@ -81,7 +86,8 @@ def test_flight_is_physically_plausible(device: Device) -> None:
         assert live.peak_current >= before.peak_current
         assert abs(live.power_stage_temperature - before.power_stage_temperature) <= 1
     assert all(live.bec_current == 0 for live in flight) == (device is Device.JIVEPRO)
-    charge = sum(max(live.battery_current, 0) / 10 * 0.01 / 3.6 for live in flight)
+    amperes = [max(live.battery_current, 0) / 10 for live in flight]
+    charge = sum(amperes) * 0.01 / 3.6
     assert flight[-1].consumed_charge == pytest.approx(charge, rel=0.02, abs=2)
     climb = min(flight, key=lambda live: live.battery_voltage)
     assert climb.motor_current >= climb.battery_current > 500
@@ -116,16 +122,27 @@ def test_requested_error_bits_and_swapped_devices_are_sent() -> None:
     frames = esc.frames_until(40 * S)
     assert (esc.device, esc.layout) == (Device.UHV, Layout.LEGACY)
     for sent, frame in zip(frames, received(frames), strict=True):
-        at, data = sent.time_ns / S, sent.data
+        at = sent.time_ns / S
+        data = sent.data
         assert frame.layout is (Layout.V4 if at < 20 else Layout.LEGACY)
         if isinstance(data, LiveData):
-            expected = (5 <= at < 7) | (at >= 6) << 8
-            assert data.operating_errors & ~(1 << OperatingError.PROGRAMMING_ALLOWED) == expected
+            others = data.operating_errors & ~(1 << OperatingError.PROGRAMMING_ALLOWED)
+            undervoltage = 5 <= at < 7
+            overcurrent = at >= 6
+            assert others == undervoltage | overcurrent << OperatingError.BEC_OVERCURRENT
         else:
-            device = Device.KOSMIK if at < 20 else Device.JIVEPRO if at < 30 else Device.UHV
-            assert data.device_and_variant >> 10 == device
-            assert data.selftest_errors == (3 <= at < 6) << SelfTestError.TEST_EEPROM_SIZE
+            assert data.device_and_variant >> 10 == device_at(at)
+            has_error = 3 <= at < 6
+            assert data.selftest_errors == has_error << SelfTestError.TEST_EEPROM_SIZE
     fresh = next(sent.data for sent in frames if sent.time_ns >= 20 * S)
     assert isinstance(fresh, LiveData)
-    found = fresh.peak_current, fresh.consumed_charge, fresh.operating_state
-    assert found == (0, 0, OperatingState.Selftest)
+    assert fresh.peak_current == 0
+    assert fresh.consumed_charge == 0
+    assert fresh.operating_state == OperatingState.Selftest
+
+
+def device_at(seconds: float) -> Device:
+    """Return the device on the line in the test above."""
+    if seconds < 20:
+        return Device.KOSMIK
+    return Device.JIVEPRO if seconds < 30 else Device.UHV

@@ -47,9 +47,12 @@ def families(document: dict[str, Any]) -> dict[str, Metric]:
     """Return the metrics by name, including ``_total``."""
     text = metrics(document)
     found = list(text_string_to_metric_families(text))
-    names = [family.name + ("_total" if family.type == "counter" else "") for family in found]
-    assert len(set(names)) == len(names)
-    return dict(zip(names, found, strict=True))
+    named = {}
+    for family in found:
+        suffix = "_total" if family.type == "counter" else ""
+        named[family.name + suffix] = family
+    assert len(named) == len(found)
+    return named
 
 
 def value(document: dict[str, Any], name: str, **labels: str) -> float | None:
@@ -65,12 +68,13 @@ def value(document: dict[str, Any], name: str, **labels: str) -> float | None:
 def document() -> dict[str, Any]:
     bench = Bench(2)
     bench.run(6)
-    ports = [
-        PortFacts(f"esc{n}", f"/dev/{n}", True, line_errors={"parity": n, "framing": 0})
-        for n in (1, 2)
-    ]
+    ports = []
+    for number in (1, 2):
+        errors = {"parity": number, "framing": 0}
+        ports.append(PortFacts(f"esc{number}", f"/dev/{number}", True, line_errors=errors))
     can = CanFacts("socketcan", "can0", 500_000, True, error_counters=(8, 0))
-    return with_nodes(bench.document(ports=ports, can=can, store=StoreFacts(1, "disk full")))
+    store = StoreFacts(1, "disk full")
+    return with_nodes(bench.document(ports=ports, can=can, store=store))
 
 
 def test_names_have_the_prefix_and_pass_the_tool_of_prometheus(
@@ -81,9 +85,8 @@ def test_names_have_the_prefix_and_pass_the_tool_of_prometheus(
         assert (family.type == "counter") == name.endswith("_total")
         assert family.documentation
     if PROMTOOL is not None:
-        subprocess.run(
-            [PROMTOOL, "check", "metrics"], input=metrics(document), text=True, check=True
-        )
+        command = [PROMTOOL, "check", "metrics"]
+        subprocess.run(command, input=metrics(document), text=True, check=True)
 
 
 def test_values_are_in_base_units(document: dict[str, Any]) -> None:
@@ -110,8 +113,10 @@ def test_values_are_in_base_units(document: dict[str, Any]) -> None:
     for name, number in expected.items():
         assert value(document, f"kontronik_{name}", esc="esc1") == pytest.approx(number), name
     named = set(families(document))
-    for name in ({"cell_count": "cells"}.get(name, name) for name in document["units"]):
-        assert any(re.fullmatch(rf"kontronik_{name}(_(?!error).*)?", each) for each in named), name
+    for key in document["units"]:
+        name = "cells" if key == "cell_count" else key
+        metric = re.compile(rf"kontronik_{name}(_(?!error).*)?")
+        assert any(metric.fullmatch(each) for each in named), name
     assert value(document, "kontronik_can_bitrate") == 500_000
     assert value(document, "kontronik_can_transmit_errors") == 8
     assert value(document, "kontronik_uptime_seconds") == 6
@@ -145,12 +150,20 @@ def test_error_bits_have_a_severity_and_unknown_ones_are_shown_if_set() -> None:
     bench.run(3)
     errors = LiveData(operating_errors=1 << OperatingError.OVERVOLTAGE | 1 << 30)
     bench.gateway.receive_bytes(0, encode(errors, Layout.V4), bench.now, bench.now)
-    samples = families(bench.document())["kontronik_operating_error"].samples
-    assert len(samples) == len(OperatingError) + 1
-    known = {s.labels["error"]: s.labels["severity"] for s in samples}
-    assert {bit.text: bit.severity.value for bit in OperatingError} | {"bit30": "error"} == known
-    assert {s.labels["error"] for s in samples if s.value == 1} == {"overvoltage", "bit30"}
-    assert len(families(bench.document())["kontronik_selftest_error"].samples) == len(SelfTestError)
+    found = families(bench.document())
+    samples = found["kontronik_operating_error"].samples
+    severities = {}
+    active = set()
+    for sample in samples:
+        error = sample.labels["error"]
+        severities[error] = sample.labels["severity"]
+        if sample.value == 1:
+            active.add(error)
+    expected = {bit.text: bit.severity.value for bit in OperatingError}
+    assert severities == expected | {"bit30": "error"}
+    assert len(samples) == len(severities)
+    assert active == {"overvoltage", "bit30"}
+    assert len(found["kontronik_selftest_error"].samples) == len(SelfTestError)
 
 
 # --- the server
@@ -179,9 +192,8 @@ def clock(document: dict[str, Any]) -> Clock:
 @pytest.fixture
 def port(file: Path, clock: Clock) -> Iterator[int]:
     """Start a server and return its port, which the system chooses."""
-    with metrics_module.server_of(
-        partial(look_at, file), "127.0.0.1", 0, lambda: clock.now
-    ) as made:
+    look = partial(look_at, file)
+    with metrics_module.server_of(look, "127.0.0.1", 0, lambda: clock.now) as made:
         thread = threading.Thread(target=made.serve_forever, args=(0.05,))
         thread.start()
         yield made.server_port
@@ -236,9 +248,13 @@ def test_damaged_file_is_one_line_without_a_traceback(
     text = json.dumps(document)
     damaged: list[object] = [None, 3, [], "x", {}, {"program": "x"}, document | {"format": 99}]
     for key in ("can", "escs", "gateway", "monotonic_ns", "process", "units"):
-        damaged += [{k: v for k, v in document.items() if k != key}, document | {key: ["x"]}]
-    cut = [text[: len(text) * part // 9].encode() for part in range(9)]
-    for data in [*cut, b"\xff\xfe", b"[" * 100_000, *(json.dumps(d).encode() for d in damaged)]:
+        without = dict(document)
+        del without[key]
+        damaged += [without, document | {key: ["x"]}]
+    contents = [b"\xff\xfe", b"[" * 100_000]
+    contents += [text[: len(text) * part // 9].encode() for part in range(9)]
+    contents += [json.dumps(each).encode() for each in damaged]
+    for data in contents:
         file.write_bytes(data)
         status, _, line = ask(port)
         assert (status, str(file) in line, line.count("\n")) == (503, True, 1), data[:99]
@@ -300,7 +316,9 @@ def test_command_serves_the_configured_file_until_sigterm(
     program = GatewayProcess(None, toml, "--listen", "127.0.0.1:0", command="metrics")
     try:
         program.wait_for_line(f"serves {tmp_path}/own.json")
-        assert ask(int(program.log.partition("127.0.0.1:")[2].partition("/")[0]))[0] == 503
+        address = program.log.partition("127.0.0.1:")[2]
+        status, _, _ = ask(int(address.partition("/")[0]))
+        assert status == 503
         assert program.end() == 0
     finally:
         program.kill()

@@ -15,7 +15,7 @@ from simulated_bus import STEP_NS, Timed, flight, layout_of, with_errors
 from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.member import alarms_of
-from kontronik_can_gw.desk.monitor.model import HISTORY_S, Monitor
+from kontronik_can_gw.desk.monitor.model import HISTORY_S, Monitor, Track
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS
@@ -25,11 +25,18 @@ from kontronik_can_gw.frames import CanFrame
 
 ONE = layout_of(["esc1"])
 TWO = layout_of(["left", "right"])
-LINK_ID = next(
-    plan.can_id
-    for plan in ONE.layout.messages
-    if any(s.source and s.source.name == "link_state" for s in plan.signals)
-)
+
+
+def id_of(source: str) -> int:
+    """Return the id of the message with a source in the shipped DBC."""
+    for plan in ONE.layout.messages:
+        for signal in plan.signals:
+            if signal.source and signal.source.name == source:
+                return plan.can_id
+    raise KeyError(source)
+
+
+LINK_ID = id_of("link_state")
 
 
 def watched(bus: BusLayout, frames: Timed, until: float | None = None) -> Monitor:
@@ -57,12 +64,15 @@ def test_extremes_and_availability_are_right_for_any_values(values: list[int | N
     esc = monitor.escs[0]
     sent: list[float] = []
     for step, value in enumerate(values):
-        current = None if value is None else max(-3276.0, min(3276.0, value / 10))
-        data = {signal.name: 0 for signal in message.signals}
-        data["BatteryCurrent"] = "NotAvailable" if current is None else current  # type: ignore[assignment]
-        monitor.take(CanFrame(message.frame_id, message.encode(data)), step * STEP_NS)
-        if current is not None:
+        current = None
+        data: dict[str, float | str] = {signal.name: 0 for signal in message.signals}
+        data["BatteryCurrent"] = "NotAvailable"
+        if value is not None:
+            current = max(-3276.0, min(3276.0, value / 10))
+            data["BatteryCurrent"] = current
             sent.append(current)
+        frame = CanFrame(message.frame_id, message.encode(data))
+        monitor.take(frame, step * STEP_NS)
         assert esc.number("battery_current") == pytest.approx(current)
         track = esc.tracks["battery_current"]
         if sent:
@@ -92,9 +102,16 @@ def test_any_frames_are_accepted_without_an_exception(
         for esc in monitor.escs:
             assert not any(isinstance(esc.value(source), bool) for source in esc.units)
             for track in esc.tracks.values():
-                assert (track.low is None) == (track.high is None)
-                assert track.low is None or track.high is None or track.low <= track.high
-                assert len(track.history) <= HISTORY_S
+                check_track(track)
+
+
+def check_track(track: Track) -> None:
+    assert len(track.history) <= HISTORY_S
+    if track.low is None:
+        assert track.high is None
+    else:
+        assert track.high is not None
+        assert track.low <= track.high
 
 
 def test_old_values_are_not_shown_after_the_last_frame() -> None:
@@ -105,8 +122,12 @@ def test_old_values_are_not_shown_after_the_last_frame() -> None:
     monitor.advance(7 * SECOND_NS)
     esc = monitor.escs[0]
     assert all(esc.value(source) is None for source in esc.units)
-    assert (esc.state, esc.link, esc.device_text, esc.active) == (None, None, "", [])
-    assert {monitor.gateway.text(name) for name in ("gateway_state", "can_state")} == {None}
+    assert esc.state is None
+    assert esc.link is None
+    assert esc.device_text == ""
+    assert esc.active == []
+    assert monitor.gateway.text("gateway_state") is None
+    assert monitor.gateway.text("can_state") is None
     assert monitor.silent_ns >= 5 * SECOND_NS
     assert esc.tracks["battery_voltage"].high is not None, "extremes stay"
 
@@ -129,7 +150,8 @@ def test_a_link_is_not_lost_because_its_message_is_received_later() -> None:
     """
     frames = flight(ONE, 3, until=1)
     (esc,) = watched(ONE, frames).escs
-    assert (esc.number("battery_voltage"), normalize(esc.link or "")) == (None, "lost")
+    assert esc.number("battery_voltage") is None
+    assert normalize(esc.link or "") == "lost"
     lost = [frame for _, frame in frames if frame.can_id == LINK_ID][-1]
     monitor = watched(ONE, flight(ONE, 2))
     monitor.take(lost, 2 * SECOND_NS)
@@ -207,5 +229,7 @@ def test_a_users_dbc_with_other_names_and_units_shows_the_same(tmp_path: Path) -
         ("undervoltage", Severity.ERROR),
         ("bit30", Severity.WARNING),
     ]
-    assert (esc.has("motor_speed"), esc.number("motor_speed"), esc.link) == (False, None, None)
+    assert not esc.has("motor_speed")
+    assert esc.number("motor_speed") is None
+    assert esc.link is None
     assert monitor.document()["units"]["battery_voltage"] == "V"

@@ -49,7 +49,8 @@ def handlers() -> Iterator[None]:
 
 
 def document(done: Done) -> dict[str, Any]:
-    assert (done.code, done.out.count("\n")) == (0, 1), done.err
+    assert done.code == 0, done.err
+    assert done.out.count("\n") == 1, done.err
     found: dict[str, Any] = json.loads(done.out)
     return found
 
@@ -69,7 +70,8 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
 ) -> None:
     """Opening some adapters writes to them, and nothing may be written to an ESC."""
     port = written(tmp_path / "ttyESC", "")
-    toml = written(tmp_path / "g.toml", f'[can]\ninterface = "virtual"\n[[esc]]\nport = "{port}"\n')
+    text = f'[can]\ninterface = "virtual"\n[[esc]]\nport = "{port}"\n'
+    toml = written(tmp_path / "g.toml", text)
     done = run(*command, "-c", toml, "--interface", "slcan", "--channel", f"{port}@115200")
     assert done.code == 2
     assert "nothing may be sent to an ESC" in done.err
@@ -143,7 +145,8 @@ def seconds_of(document: dict[str, Any]) -> float:
 
 
 def documents(done: Done) -> list[dict[str, Any]]:
-    assert (done.code, "Traceback" in done.err) == (0, False), done.err
+    assert done.code == 0, done.err
+    assert "Traceback" not in done.err
     return [json.loads(line) for line in done.out.splitlines()]
 
 
@@ -175,7 +178,9 @@ def test_stream_has_no_old_values_in_a_gap_of_a_recording(tmp_path: Path, clock:
     found = documents(run("monitor", file, "--stream", "--speed", 30))
     voltages = [one["escs"][0]["values"]["battery_voltage"] for one in found]
     assert len(found) == 64
-    assert all(voltages[:3]) and set(voltages[5:59]) == {None} and all(voltages[60:])
+    assert all(voltages[:3])
+    assert set(voltages[5:59]) == {None}
+    assert all(voltages[60:])
 
 
 def test_stream_of_a_bus_leaves_out_missed_seconds() -> None:
@@ -234,9 +239,13 @@ def test_stream_of_a_bus_without_frames_gives_the_reason() -> None:
     ],
 )
 def test_a_name_may_be_an_interface_or_a_recording(
-    name: str, words: tuple[str, ...], channel: str | None, log: Path, tmp_path: Path,
+    name: str,
+    words: tuple[str, ...],
+    channel: str | None,
+    log: Path,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     for file in ("lo", "flight"):
         shutil.copy(log, tmp_path / file)
     monkeypatch.chdir(tmp_path)

@@ -14,7 +14,7 @@ from rich.text import Text
 from simulated_bus import flight, layout_of, with_errors
 
 from kontronik_can_gw.desk.monitor.lines import number, shorten
-from kontronik_can_gw.desk.monitor.model import QUANTITIES, Monitor
+from kontronik_can_gw.desk.monitor.model import QUANTITIES, Monitor, Quantity
 from kontronik_can_gw.desk.monitor.screen import screen, sparkline
 from kontronik_can_gw.desk.monitor.watch import obey
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
@@ -70,14 +70,17 @@ def texts(
 
 
 @given(
-    st.tuples(st.integers(1, 150), st.integers(1, 60)), st.sampled_from([1, 2, 8]), st.sampled_from(KINDS),
-    st.text("npa0129 x", max_size=5),
-)  # fmt: skip
+    size=st.tuples(st.integers(1, 150), st.integers(1, 60)),
+    count=st.sampled_from([1, 2, 8]),
+    kind=st.sampled_from(KINDS),
+    keys=st.text("npa0129 x", max_size=5),
+)
 @settings(max_examples=30, deadline=None)
 def test_any_size_and_any_keys_are_accepted(
     size: tuple[int, int], count: int, kind: str, keys: str
 ) -> None:
-    monitor, page = seen(count, kind), 0
+    monitor = seen(count, kind)
+    page = 0
     for key in keys:
         page = obey(key, source_of(monitor), monitor, page)
     lines = texts(monitor, size, page=page)
@@ -94,7 +97,8 @@ def test_important_lines_are_never_cut_off(size: tuple[int, int], count: int) ->
         assert esc.name in whole
         for quantity in QUANTITIES[:4]:
             value = number(esc.number(quantity.source), quantity.digits)
-            assert re.search(rf"(?<![\d.]){re.escape(value)}(?![\d.])", whole), quantity.source
+            alone = rf"(?<![\d.]){re.escape(value)}(?![\d.])"
+            assert re.search(alone, whole), quantity.source
     assert whole.count("spool up") + whole.count("RPM control") == count
     assert "ERROR: battery voltage too low" in whole
     assert "ERROR: BEC current too high" in whole
@@ -115,11 +119,16 @@ def test_a_sparkline_shows_seconds_between_the_extremes_and_gaps() -> None:
     track.history.extend([0.0, 20.0, None, 24.0, 22.0])
     track.take(20.0)
     track.take(24.0)
-    quantity = next(each for each in QUANTITIES if each.source == "battery_voltage")
+    quantity = quantity_of("battery_voltage")
     assert plain(sparkline(esc, quantity, 4)) in (["▁ █▄"], ["▁ █▅"])
     assert plain(sparkline(esc, quantity, 0)) == [""]
     track.history.extend([-1e308, 1e308])
     assert plain(sparkline(esc, quantity, 2)) == ["▁▁"]
+
+
+def quantity_of(source: str) -> Quantity:
+    (found,) = [quantity for quantity in QUANTITIES if quantity.source == source]
+    return found
 
 
 def plain(lines: list[Text]) -> list[str]:
@@ -130,7 +139,7 @@ def test_a_sparkline_of_several_lines_has_eight_steps_in_each() -> None:
     (esc,) = Monitor(bus_of(1)).escs
     track = esc.tracks["battery_current"]
     track.history.extend([0.0, 7.0, 8.0, None, 15.0, 16.0, 23.0])
-    quantity = next(each for each in QUANTITIES if each.source == "battery_current")
+    quantity = quantity_of("battery_current")
     assert plain(sparkline(esc, quantity, 7, 3)) == [
         "     ▁█",
         "  ▁ ███",
@@ -142,20 +151,24 @@ def test_a_sparkline_of_several_lines_has_eight_steps_in_each() -> None:
 def test_charts_of_one_esc_use_the_available_height(size: tuple[int, int]) -> None:
     monitor = seen(1)
     lines = texts(monitor, size)
-    labels = [i for i, text in enumerate(lines) if text.startswith(tuple(LABELS))]
-    heights = [after - before for before, after in pairwise(labels)]
-    assert len(labels) == len(LABELS)
-    spare = size[1] - 24 - 6
-    assert sum(heights) + 1 >= min(len(LABELS) + max(0, spare), 8 * len(LABELS))
+    places = places_of_labels(lines)
+    heights = [after - before for before, after in pairwise(places)]
+    assert len(places) == len(LABELS)
+    spare = max(0, size[1] - 24 - 6)
+    least = min(len(LABELS) + spare, 8 * len(LABELS))
+    assert sum(heights) + 1 >= least
     assert sorted(heights, reverse=True) == heights, "the most important ones are taller"
 
 
 def test_charts_keep_their_height_when_errors_appear() -> None:
-    def places(kind: str) -> list[int]:
-        lines = texts(seen(1, kind), (80, 60))
-        return [at for at, text in enumerate(lines) if text.startswith(tuple(LABELS))]
+    before = texts(seen(1, "good"), (80, 60))
+    after = texts(seen(1, "errors"), (80, 60))
+    assert places_of_labels(before) == places_of_labels(after)
 
-    assert places("good") == places("errors")
+
+def places_of_labels(lines: list[str]) -> list[int]:
+    """Return the numbers of the lines that begin with the label of a quantity."""
+    return [at for at, text in enumerate(lines) if text.startswith(tuple(LABELS))]
 
 
 @pytest.mark.parametrize(("size", "lines"), [((80, 24), 1), ((80, 50), 4), ((120, 60), 5)])

@@ -206,7 +206,13 @@ def test_client_continues_after_an_answer_that_is_garbage(monkeypatch: pytest.Mo
     monkeypatch.setattr(mqtt_client, "MIN_PAUSE_S", 0.01)
     monkeypatch.setattr(mqtt_client, "MAX_PAUSE_S", 0.1)
     rng = random.Random(1)
-    rubbish = [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x00" * 100, b"\x20\x7f\x00", bytes(range(256)), b""]  # fmt: skip
+    rubbish = [
+        b"HTTP/1.1 400 Bad Request\r\n\r\n",
+        b"\x00" * 100,
+        b"\x20\x7f\x00",
+        bytes(range(256)),
+        b"",
+    ]
     rubbish += [b"\x20" + rng.randbytes(rng.randrange(1, 60)) for _ in range(6)]
     rubbish += [rng.randbytes(rng.randrange(1, 200)) for _ in range(6)]
     for answer in rubbish:

@@ -34,7 +34,18 @@ from kontronik_can_gw.signals.unpacker import SignalReader
 
 TOPICS = Topics("fleet", "boat")
 MS = 1_000_000
-OWN_KEYS = {"time", "available", "age", "motor", "errors", "problem", "selftest", "link_state", "firmware"}  # fmt: skip
+OWN_KEYS = {
+    "time",
+    "available",
+    "age",
+    "motor",
+    "errors",
+    "problem",
+    "selftest",
+    "link_state",
+    "firmware",
+}
+"""Keys of the JSON that are not the names of values."""
 QUIET = EscOptions(profile=(Phase("off", 1000, 0, OperatingState.MotorOff, 0),))
 
 
@@ -51,26 +62,31 @@ Published = list[tuple[int, Publication]]
 def run(made: Publisher, frames: Timed, until_s: float, step_ns: int = STEP_NS) -> Published:
     """Pass the frames at their times, and collect the messages at each step."""
     published: Published = []
-    waiting = iter([*frames, (1 << 62, frames[-1][1])] if frames else [])
-    following = next(waiting, None)
+    waiting = list(reversed(frames))
     for now in range(0, round(until_s * SECOND_NS), step_ns):
-        while following is not None and following[0] <= now:
-            made.take(following[1], following[0])
-            following = next(waiting, None)
-        published += [(now, message) for message in made.messages(now, START_S * SECOND_NS + now)]
+        while waiting and waiting[-1][0] <= now:
+            time_ns, frame = waiting.pop()
+            made.take(frame, time_ns)
+        wall_ns = START_S * SECOND_NS + now
+        for message in made.messages(now, wall_ns):
+            published.append((now, message))
     return published
 
 
+def payloads(published: Published, topic: str) -> list[tuple[int, bytes]]:
+    """Return the payloads of the messages with a topic, with their times."""
+    return [(now, message.payload) for now, message in published if message.topic == topic]
+
+
 def states(published: Published, esc: str = "esc1") -> list[tuple[int, dict[str, Any]]]:
-    return [
-        (now, json.loads(m.payload)) for now, m in published if m.topic == TOPICS.of(esc, "state")
-    ]
+    """Return the states of an ESC with their times."""
+    found = payloads(published, TOPICS.of(esc, "state"))
+    return [(now, json.loads(payload)) for now, payload in found]
 
 
 def snake(signal: str, prefix: str) -> str:
-    return re.sub(
-        r"(?<!^)(?=[A-Z])", "_", signal.removeprefix(prefix).removesuffix("Percent")
-    ).lower()
+    name = signal.removeprefix(prefix).removesuffix("Percent")
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
 
 
 def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any]:
@@ -83,9 +99,12 @@ def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any
         decoded = database.decode_message(frame.can_id, frame.data)
         assert isinstance(decoded, dict)
         for name, value in decoded.items():
-            if name.startswith(prefix):
-                text = value if isinstance(value, (int, float)) else str(value)
-                found[snake(name, prefix)] = None if text in ("NotAvailable", "Error") else text
+            if not name.startswith(prefix):
+                continue
+            plain = value if isinstance(value, (int, float)) else str(value)
+            if plain in ("NotAvailable", "Error"):
+                plain = None
+            found[snake(name, prefix)] = plain
     return found
 
 
@@ -99,18 +118,22 @@ def test_json_has_each_value_as_cantools_decodes_it(names: tuple[str, ...]) -> N
     frames = flight(bus, 12)
     made = publisher(*names)
     last = run(made, frames, 12)
-    flags = {bit.text for bits in (OperatingError, SelfTestError) for bit in bits}
+    flags = {bit.text for bit in (*OperatingError, *SelfTestError)}
+    columns = SignalReader(bus.layout).columns
     for index, name in enumerate(names):
         when, found = states(last, name)[-1]
         prefix = name.capitalize() if len(names) > 1 else ""
-        wanted = by_cantools(database, [(t, f) for t, f in frames if t <= when], prefix)
+        before = [(time_ns, frame) for time_ns, frame in frames if time_ns <= when]
+        wanted = by_cantools(database, before, prefix)
         compared = found.keys() - (OWN_KEYS - {"link_state"})
         for source in compared:
             value = found[source]
-            is_float = isinstance(value, float)
-            assert value == (pytest.approx(wanted[source]) if is_float else wanted[source]), source
+            if isinstance(value, float):
+                assert value == pytest.approx(wanted[source]), source
+            else:
+                assert value == wanted[source], source
         # Every signal is included except flags, which are in lists, and values of the gateway.
-        signals = {c.source for c in SignalReader(bus.layout).columns if c.esc == index}
+        signals = {column.source for column in columns if column.esc == index}
         assert compared == signals - flags
         assert found["electrical_speed"] > 0
         assert found["firmware"] == "4.17"
@@ -123,10 +146,15 @@ def test_errors_have_name_severity_meaning_and_set_problem() -> None:
         SelfTestError.TEST_UNDERVOLTAGE,
     )
     frames = flight(layout_of(["esc1"]), 4, [with_errors(*bits)])
-    found = states(run(publisher("esc1"), frames, 4))[-1][1]
-    named = {error["name"]: (error["severity"], error["meaning"]) for error in found["errors"]}
-    assert named["undervoltage"] == ("error", "battery voltage too low")
-    assert named["power_stage_overtemp_warning"] == ("warning", "power stage hot")
+    published = run(publisher("esc1"), frames, 4)
+    _, found = states(published)[-1]
+    errors = {error["name"]: error for error in found["errors"]}
+    undervoltage = errors["undervoltage"]
+    assert undervoltage["severity"] == "error"
+    assert undervoltage["meaning"] == "battery voltage too low"
+    hot = errors["power_stage_overtemp_warning"]
+    assert hot["severity"] == "warning"
+    assert hot["meaning"] == "power stage hot"
     assert [error["name"] for error in found["selftest"]] == ["test_undervoltage"]
     assert found["problem"] is True
 
@@ -142,16 +170,16 @@ def test_errors_have_name_severity_meaning_and_set_problem() -> None:
 def test_rate_does_not_depend_on_the_times_of_calls(rate: float, steps: list[int]) -> None:
     """Without a change, there is one message in each period, at the first call in it."""
     made = publisher("esc1", rate=rate)
-    period, first = round(SECOND_NS / rate), SECOND_NS // 2
-    now, told = 0, []
+    period = round(SECOND_NS / rate)
+    first = SECOND_NS // 2
+    topic = TOPICS.of("esc1", "state")
+    now = 0
+    told = []
     expected: dict[int, int] = {}
     for step in [0, *steps]:
         now += step * MS
-        told += [
-            now
-            for message in made.messages(now, now)
-            if message.topic == TOPICS.of("esc1", "state")
-        ]
+        topics = [message.topic for message in made.messages(now, now)]
+        told += [now] * topics.count(topic)
         if now >= first:
             expected.setdefault((now - first) // period, now)
     assert told == list(expected.values())
@@ -169,12 +197,11 @@ def changes(published: Published, key: str) -> list[tuple[int, Any]]:
 def test_only_notable_changes_are_published_at_once() -> None:
     """There is an error from 3 to 4 s. The motor runs after 6 s. The line is silent after 9 s."""
     window = ErrorWindow(OperatingError.OVERVOLTAGE, 3 * SECOND_NS, SECOND_NS)
-    start = Phase("off", 5, 0, OperatingState.MotorOff, 0)
-    profile = (start, Phase("go", 90, 60, OperatingState.Forward, 5))
-    options = EscOptions(profile=profile, faults=Faults(errors=(window,)))
-    published = run(
-        publisher("esc1", rate=0.01), flight(layout_of(["esc1"]), 11, [options], until=9), 11
-    )
+    off = Phase("off", 5, 0, OperatingState.MotorOff, 0)
+    go = Phase("go", 90, 60, OperatingState.Forward, 5)
+    options = EscOptions(profile=(off, go), faults=Faults(errors=(window,)))
+    frames = flight(layout_of(["esc1"]), 11, [options], until=9)
+    published = run(publisher("esc1", rate=0.01), frames, 11)
     times = [now for now, value in changes(published, "problem") if value is not None]
     for told, happened in zip(times[1:], (3 * SECOND_NS, 4 * SECOND_NS), strict=True):
         assert 0 <= told - happened <= 0.2 * SECOND_NS + 2 * STEP_NS
@@ -184,46 +211,57 @@ def test_only_notable_changes_are_published_at_once() -> None:
     lost = next(now for now, found in states(published) if found["link_state"] == "Lost")
     assert lost - 9 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway's own time-out is included
     assert len(states(published)) <= 10
-    topic = TOPICS.of("esc1", "available")
-    assert [m.payload for _, m in published if m.topic == topic] == [b"online", b"offline"]
-    assert not any(m.retain for _, m in published if m.topic.endswith("/state"))
+    available = payloads(published, TOPICS.of("esc1", "available"))
+    assert [payload for _, payload in available] == [b"online", b"offline"]
+    for _, message in published:
+        assert not (message.retain and message.topic.endswith("/state"))
 
 
 def test_esc_without_live_values_is_available_with_any_value() -> None:
     bus = layout_of(["esc1"])
     messages = tuple(each for each in bus.layout.messages if each.name == "EscLink")
-    lean = replace(bus, layout=replace(bus.layout, messages=messages))
+    layout = replace(bus.layout, messages=messages)
+    lean = replace(bus, layout=layout)
     published = run(Publisher(lean, TOPICS, MqttConfig()), flight(bus, 3), 3)
-    topic = TOPICS.of("esc1", "available")
-    assert [m.payload for _, m in published if m.topic == topic] == [b"online"]
+    available = payloads(published, TOPICS.of("esc1", "available"))
+    assert [payload for _, payload in available] == [b"online"]
 
 
 def test_rate_of_notable_changes_is_limited() -> None:
-    windows = tuple(
-        ErrorWindow(OperatingError.OVERVOLTAGE, start, 30 * MS)
-        for start in range(0, 20 * SECOND_NS, 60 * MS)
-    )
-    options = EscOptions(profile=QUIET.profile, faults=Faults(errors=windows))
+    windows = []
+    for start in range(0, 20 * SECOND_NS, 60 * MS):
+        windows.append(ErrorWindow(OperatingError.OVERVOLTAGE, start, 30 * MS))
+    options = EscOptions(profile=QUIET.profile, faults=Faults(errors=tuple(windows)))
     frames = flight(layout_of(["esc1"]), 20, [options])
-    times = [now for now, _ in states(run(publisher("esc1", rate=0.01), frames, 20))]
-    gaps = [b - a for a, b in pairwise(times)]
+    published = run(publisher("esc1", rate=0.01), frames, 20)
+    times = [now for now, _ in states(published)]
+    gaps = [after - before for before, after in pairwise(times)]
     assert len(times) > 50
     assert min(gaps) >= MIN_PAUSE_NS
 
 
 def test_silent_gateway_is_offline_after_three_seconds() -> None:
     bus = layout_of(["esc1"])
-    frames = [entry for entry in flight(bus, 10) if not 4 * SECOND_NS < entry[0] < 9 * SECOND_NS]
+    frames = []
+    for now, frame in flight(bus, 10):
+        if not 4 * SECOND_NS < now < 9 * SECOND_NS:
+            frames.append((now, frame))
     published = run(publisher("esc1"), frames, 10)
     for esc in ("esc1", ""):
-        told = [(now, m.payload) for now, m in published if m.topic == TOPICS.of(esc, "available")]
-        assert [payload for _, payload in told] == [b"online", b"offline", b"online"]
-    assert 7 * SECOND_NS <= told[1][0] <= 7.3 * SECOND_NS
-    assert 9 * SECOND_NS <= told[2][0] <= 9.3 * SECOND_NS
-    heard = [found for now, found in states(published) if now < 4 * SECOND_NS][-1]
-    assert (heard["errors"], heard["selftest"], heard["problem"]) == ([], [], False)
-    silent = [found for now, found in states(published) if 7 * SECOND_NS < now < 9 * SECOND_NS][-1]
-    assert {silent[key] for key in silent if key not in ("time", "available", "age")} == {None}
+        available = payloads(published, TOPICS.of(esc, "available"))
+        assert [payload for _, payload in available] == [b"online", b"offline", b"online"]
+    _, (offline_ns, _), (online_ns, _) = payloads(published, TOPICS.of("", "available"))
+    assert 7 * SECOND_NS <= offline_ns <= 7.3 * SECOND_NS
+    assert 9 * SECOND_NS <= online_ns <= 9.3 * SECOND_NS
+    found = states(published)
+    heard = [state for now, state in found if now < 4 * SECOND_NS][-1]
+    assert heard["errors"] == []
+    assert heard["selftest"] == []
+    assert heard["problem"] is False
+    silent = [state for now, state in found if 7 * SECOND_NS < now < 9 * SECOND_NS][-1]
+    for key in ("time", "available", "age"):
+        del silent[key]
+    assert set(silent.values()) == {None}
 
 
 def test_a_message_has_its_time_in_utc() -> None:
@@ -246,9 +284,19 @@ DEVICE_CLASSES: dict[str | None, tuple[set[str | None], set[str | None]]] = {
     None: ({"rpm", "%", "mAh", "µs", None}, {*ANY, None}),
 }
 COMPONENT_KEYS = {
-    "platform", "name", "unique_id", "value_template", "device_class", "state_class", "unit_of_measurement",
-    "options", "entity_category", "suggested_display_precision", "availability", "availability_mode",
-}  # fmt: skip
+    "platform",
+    "name",
+    "unique_id",
+    "value_template",
+    "device_class",
+    "state_class",
+    "unit_of_measurement",
+    "options",
+    "entity_category",
+    "suggested_display_precision",
+    "availability",
+    "availability_mode",
+}
 
 
 def test_every_entity_is_valid_and_shows_a_key_of_the_state() -> None:
@@ -256,38 +304,53 @@ def test_every_entity_is_valid_and_shows_a_key_of_the_state() -> None:
     published = run(publisher("left", "right", discovery="ha"), frames, 3)
     ids: list[str] = []
     for esc in ("left", "right", ""):
-        topic, newest = TOPICS.discovery("ha", esc), states(published, esc)[-1][1]
-        found = next(json.loads(m.payload) for _, m in published if m.topic == topic)
-        for key, component in found["components"].items():
-            assert set(component) <= COMPONENT_KEYS, key
+        topic = TOPICS.discovery("ha", esc)
+        _, newest = states(published, esc)[-1]
+        _, announced = payloads(published, topic)[0]
+        for key, component in json.loads(announced)["components"].items():
             assert component["unique_id"] == f"{topic.split('/')[2]}_{key}"
             ids.append(component["unique_id"])
-            assert component["name"]
-            shown = re.findall(r"value_json\.(\w+)", component["value_template"])
-            assert shown and set(shown) <= set(newest), key
-            assert component.get("entity_category") in (None, "diagnostic")
-            kind = component.get("device_class")
-            if component["platform"] == "binary_sensor":
-                assert kind == "problem"
-                continue
-            assert component["platform"] == "sensor"
-            units, classes = DEVICE_CLASSES[kind]
-            assert component.get("unit_of_measurement") in units, key
-            assert component.get("state_class") in classes, key
-            options = component.get("options", [])
-            assert len(options) == len(set(options))
-            assert (len(options) > 1) == (kind == "enum")
+            check_component(key, component, newest)
     assert len(ids) == len(set(ids)) > 100
+
+
+def check_component(key: str, component: dict[str, Any], newest: dict[str, Any]) -> None:
+    """Check an entity of Home Assistant, which shows keys of the newest state."""
+    assert set(component) <= COMPONENT_KEYS, key
+    assert component["name"]
+    shown = re.findall(r"value_json\.(\w+)", component["value_template"])
+    assert shown, key
+    assert set(shown) <= set(newest), key
+    assert component.get("entity_category") in (None, "diagnostic")
+    kind = component.get("device_class")
+    if component["platform"] == "binary_sensor":
+        assert kind == "problem"
+        return
+    assert component["platform"] == "sensor"
+    units, classes = DEVICE_CLASSES[kind]
+    assert component.get("unit_of_measurement") in units, key
+    assert component.get("state_class") in classes, key
+    options = component.get("options", [])
+    assert len(options) == len(set(options))
+    assert (len(options) > 1) == (kind == "enum")
 
 
 def test_an_esc_is_announced_when_heard_and_again_when_identified() -> None:
     bus = layout_of(["esc1"])
     columns = SignalReader(bus.layout).columns
-    info = {c.key for c in columns if c.source in ("device", "firmware_main")}
-    frames = [(t, f) for t, f in flight(bus, 10) if t > 4 * SECOND_NS or f.key not in info]
+    info = {column.key for column in columns if column.source in ("device", "firmware_main")}
+    frames = []
+    for now, frame in flight(bus, 10):
+        if now > 4 * SECOND_NS or frame.key not in info:
+            frames.append((now, frame))
     topic = TOPICS.discovery("ha", "esc1")
-    for heard, models in ((frames, ["ESC", "KOSMIK"]), ([], [])):
-        published = run(publisher("esc1", discovery="ha"), heard, 10)
-        found = [json.loads(m.payload)["device"] for _, m in published if m.topic == topic]
-        assert [about["model"] for about in found] == models
-        assert ["sw_version" in about for about in found] == [False, True][: len(models)]
+    silent = run(publisher("esc1", discovery="ha"), [], 10)
+    assert payloads(silent, topic) == []
+    published = run(publisher("esc1", discovery="ha"), frames, 10)
+    first, second = payloads(published, topic)
+    unknown = json.loads(first[1])["device"]
+    identified = json.loads(second[1])["device"]
+    assert unknown["model"] == "ESC"
+    assert "sw_version" not in unknown
+    assert identified["model"] == "KOSMIK"
+    assert "sw_version" in identified

@@ -33,7 +33,7 @@ def _logged(path: Path) -> list[LogFrame]:
 
 def _kinds(found: list[LogFrame]) -> list[tuple[str, int, bytes]]:
     """Return the kind, the id and the data of frames. Error frames have no id and no data here."""
-    kinds = []
+    kinds: list[tuple[str, int, bytes]] = []
     for item in found:
         if item.frame.can_id & ERROR:
             kinds.append((item.kind, 0, b""))

@@ -33,21 +33,25 @@ def bit_places(start: int, length: int, little: bool) -> list[tuple[int, int]]:
     if little:
         return [divmod(start + n, 8) for n in range(length)]
     first = start // 8 * 8 + 7 - start % 8  # in the order of transmission
-    return [(n // 8, 7 - n % 8) for n in range(first + length - 1, first - 1, -1)]
+    last = first + length - 1
+    return [(n // 8, 7 - n % 8) for n in range(last, first - 1, -1)]
 
 
 def put(data: bytearray, raw: int, start: int, length: int, little: bool) -> None:
     """Write a raw value bit by bit, a negative one as two's complement."""
+    unsigned = raw % (1 << length)
     for number, (byte, bit) in enumerate(bit_places(start, length, little)):
-        if raw % (1 << length) >> number & 1:
+        if unsigned >> number & 1:
             data[byte] |= 1 << bit
 
 
 def get(data: bytes, start: int, length: int, little: bool, signed: bool = False) -> int:
     """Read a raw value bit by bit."""
-    places = bit_places(start, length, little)
-    raw = sum((data[byte] >> bit & 1) << number for number, (byte, bit) in enumerate(places))
-    return raw - (1 << length) if signed and raw >> length - 1 else raw
+    raw = 0
+    for number, (byte, bit) in enumerate(bit_places(start, length, little)):
+        raw |= (data[byte] >> bit & 1) << number
+    is_negative = signed and raw >> length - 1
+    return raw - (1 << length) if is_negative else raw
 
 
 # --- values to publish, typed from the sheet
@@ -70,7 +74,8 @@ class Known:
     gateway: bool = False
 
 
-STATES, DEVICES = sheet.OPERATING_STATES, sheet.DEVICES
+STATES = sheet.OPERATING_STATES
+DEVICES = sheet.DEVICES
 LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
 LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
 GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay")))
@@ -79,20 +84,52 @@ CAN_STATES = dict(
 )
 
 ERROR_BITS = [
-    "undervoltage", "overvoltage", "overcurrent_integral_error", "overcurrent_integral_warning",
-    "power_stage_overtemp_warning", "power_stage_overtemp_error", "bec_undervoltage", "bec_overvoltage",
-    "bec_overcurrent", "bec_overtemperature", "switched_off_by_running_down", "capacity_limit_reached",
-    "operating_error_found", "operating_warning_found", "selftest_error", "eeprom_error", "watchdog_error_tripped",
-    "programming_allowed", "limit_battery_voltage_minimum", "limit_current_maximum", "limit_power_stage_temperature",
-    "limit_bec_temperature", "limit_bec_current", "limit_discharged_capacity",
-]  # fmt: skip
+    "undervoltage",
+    "overvoltage",
+    "overcurrent_integral_error",
+    "overcurrent_integral_warning",
+    "power_stage_overtemp_warning",
+    "power_stage_overtemp_error",
+    "bec_undervoltage",
+    "bec_overvoltage",
+    "bec_overcurrent",
+    "bec_overtemperature",
+    "switched_off_by_running_down",
+    "capacity_limit_reached",
+    "operating_error_found",
+    "operating_warning_found",
+    "selftest_error",
+    "eeprom_error",
+    "watchdog_error_tripped",
+    "programming_allowed",
+    "limit_battery_voltage_minimum",
+    "limit_current_maximum",
+    "limit_power_stage_temperature",
+    "limit_bec_temperature",
+    "limit_bec_current",
+    "limit_discharged_capacity",
+]
 TEST_BITS = [
-    "test_phase_low_side", "test_phase_high_side", "test_short_to_ground", "test_back_emf_offset",
-    "test_current_zero_point", "test_undervoltage", "test_overvoltage", "test_bec_undervoltage",
-    "test_bec_overvoltage", "test_reverse_polarity_fuse", "test_overvoltage_fuse", "test_power_stage_overtemp",
-    "test_bec_overtemperature", "test_motor_phase_missing", "test_eeprom_empty", "test_eeprom_stick_positions",
-    "test_eeprom_checksum", "test_eeprom_size", "test_eeprom_version",
-]  # fmt: skip
+    "test_phase_low_side",
+    "test_phase_high_side",
+    "test_short_to_ground",
+    "test_back_emf_offset",
+    "test_current_zero_point",
+    "test_undervoltage",
+    "test_overvoltage",
+    "test_bec_undervoltage",
+    "test_bec_overvoltage",
+    "test_reverse_polarity_fuse",
+    "test_overvoltage_fuse",
+    "test_power_stage_overtemp",
+    "test_bec_overtemperature",
+    "test_motor_phase_missing",
+    "test_eeprom_empty",
+    "test_eeprom_stick_positions",
+    "test_eeprom_checksum",
+    "test_eeprom_size",
+    "test_eeprom_version",
+]
 
 JIVEPRO = 3
 
@@ -114,7 +151,11 @@ def _fields(part: str, fields: Sequence[sheet.Field]) -> dict[str, Known]:
     def reader(name: str, steps: int) -> Reader:
         return _of(part, lambda _, data: Fraction(getattr(data, name), steps))
 
-    return {f.name: Known(f.unit.translate(spelled), reader(f.name, f.steps)) for f in fields}
+    known = {}
+    for each in fields:
+        unit = each.unit.translate(spelled)
+        known[each.name] = Known(unit, reader(each.name, each.steps))
+    return known
 
 
 def _bits(part: str, word: str, names: Sequence[str]) -> dict[str, Known]:
@@ -147,6 +188,40 @@ def _counters(
     return {pair[0]: Known("", reader(pair[-1]), rolls=True, gateway=gateway) for pair in pairs}
 
 
+def _motor_speed(esc: EscTelemetry, live: LiveData) -> Fraction:
+    return Fraction(live.electrical_speed, esc.settings.pole_pairs)
+
+
+def _output_speed(esc: EscTelemetry, live: LiveData) -> Fraction:
+    return live.electrical_speed / (esc.settings.pole_pairs * esc.settings.gear)
+
+
+def _battery_power(_esc: EscTelemetry, live: LiveData) -> Fraction:
+    return Fraction(live.battery_voltage * live.battery_current, 1000)
+
+
+def _mean_cell_voltage(esc: EscTelemetry, live: LiveData) -> Fraction | None:
+    if not esc.cells:
+        return None
+    return Fraction(live.battery_voltage, 100 * esc.cells)
+
+
+def _data_age(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> int | None:
+    if esc.live_ns is None:
+        return None
+    return max(0, now - esc.live_ns) // 10**6
+
+
+def _frame_rate(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
+    if esc.frame_rate is None:
+        return None
+    return Fraction(esc.frame_rate, 10)
+
+
+def _uptime(_esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction:
+    return Fraction((now - gateway.started_ns) // 10**6, 1000)
+
+
 KNOWN: dict[str, Known] = {
     **_fields("live", sheet.LIVE_FIELDS),
     "bec_current": Known("A", _of("live", _bec_current)),
@@ -161,51 +236,113 @@ KNOWN: dict[str, Known] = {
     "variant": Known("", _of("info", lambda _, i: i.device_and_variant & 1023)),
     "firmware_main": Known("", _of("info", lambda _, i: i.firmware_word >> 8)),
     "firmware_sub": Known("", _of("info", lambda _, i: i.firmware_word & 255)),
-    "motor_speed": Known("1/min", _of("live", lambda e, v: Fraction(v.electrical_speed, e.settings.pole_pairs))),
-    "output_speed": Known(
-        "1/min", _of("live", lambda e, v: v.electrical_speed / (e.settings.pole_pairs * e.settings.gear))),
-    "battery_power": Known("W", _of("live", lambda _, v: Fraction(v.battery_voltage * v.battery_current, 1000))),
-    "mean_cell_voltage": Known(
-        "V", _of("live", lambda e, v: Fraction(v.battery_voltage, 100 * e.cells) if e.cells else None)),
+    "motor_speed": Known("1/min", _of("live", _motor_speed)),
+    "output_speed": Known("1/min", _of("live", _output_speed)),
+    "battery_power": Known("W", _of("live", _battery_power)),
+    "mean_cell_voltage": Known("V", _of("live", _mean_cell_voltage)),
     "energy_used": Known("Wh", lambda e, _g, _n: Fraction(e.energy_mw_ns // 10**9, 3600 * 1000)),
     "motor_run_time": Known("s", lambda e, _g, _n: Fraction(e.run_time_ns, 10**9)),
     "link_state": Known("", lambda e, _g, _n: int(e.link), LINKS),
     "layout": Known("", lambda e, _g, _n: e.layout, LAYOUTS),
-    "data_age": Known("ms", lambda e, _g, now: None if e.live_ns is None else max(0, now - e.live_ns) // 10**6),
-    "frame_rate": Known("Hz", lambda e, _g, _n: None if e.frame_rate is None else Fraction(e.frame_rate, 10)),
+    "data_age": Known("ms", _data_age),
+    "frame_rate": Known("Hz", _frame_rate),
     **_counters("losses suspect_frames", lambda e, _: e),
-    **_counters("crc_errors dropped_bytes live_frames=live info_frames=info received_bytes=bytes", lambda e, _: e.counters),
+    **_counters(
+        "crc_errors dropped_bytes live_frames=live info_frames=info received_bytes=bytes",
+        lambda e, _: e.counters,
+    ),
     "gateway_state": Known("", lambda _e, g, _n: int(g.state), GATEWAY_STATES, gateway=True),
     "can_state": Known("", lambda _e, g, _n: int(g.can_state), CAN_STATES, gateway=True),
     "esc_count": Known("", lambda _e, g, _n: g.esc_count, gateway=True),
     "escs_ok": Known("", lambda _e, g, _n: g.escs_ok, gateway=True),
-    "uptime": Known("s", lambda _e, g, now: Fraction((now - g.started_ns) // 10**6, 1000), gateway=True),
+    "uptime": Known("s", _uptime, gateway=True),
     **_counters(
-        "sent_frames replaced_frames send_failures received_frames bus_off_count dropped_frames id_conflicts",
-        lambda _, gateway: gateway, True),
-}  # fmt: skip
+        "sent_frames replaced_frames send_failures received_frames bus_off_count dropped_frames "
+        "id_conflicts",
+        lambda _, gateway: gateway,
+        gateway=True,
+    ),
+}
 
 UNITS: dict[str, list[tuple[str, str, str]]] = {
-    "V": [("V|v|Volt|Volts|volt|VOLT|Unit_Volt|[V]|| |-|none|Unit_None|unitless|N/A", "1", "0"),
-          ("mV|mv|Unit_MilliVolt|millivolts|(mV)", "1000", "0"), ("kV|KV", "1/1000", "0")],
-    "A": [("A|Amp|Amps|amps|ampere|Ampere|Unit_Amper|Unit_Ampere", "1", "0"), ("mA|Unit_MilliAmper", "1000", "0"), ("kA", "1/1000", "0")],
-    "W": [("W|watts|Watt|Unit_Watt", "1", "0"), ("kW|KW|kw|Kw|Unit_KiloWatt", "1/1000", "0"), ("mW", "1000", "0")],
-    "Wh": [("Wh", "1", "0"), ("kWh", "1/1000", "0"), ("J", "3600", "0"), ("kJ", "18/5", "0"), ("mWh", "1000", "0")],
-    "mAh": [("mAh|mA*h", "1", "0"),
-            ("Ah|AH|A h|AmpHour|amperehour|ampere*hour|Unit_AmperHour", "1/1000", "0"), ("As|C|coulomb", "18/5", "0")],
-    "s": [("s|sec|secs|Seconds|Unit_Secon", "1", "0"), ("ms", "1000", "0"), ("min", "1/60", "0"), ("h", "1/3600", "0"),
-          ("us", "1000000", "0")],
-    "us": [("us|µs|μs|Âµs|usec|uSec|Unit_MicroSecon|microseconds", "1", "0"), ("ms|msec|mSec|millisecond|Unit_MilliSecon", "1/1000", "0"),
-           ("s", "1/1000000", "0")],
-    "ms": [("ms", "1", "0"), ("s", "1/1000", "0"), ("us", "1000", "0")],
-    "Hz": [("Hz|hz|Unit_Hertz|1/s", "1", "0"), ("kHz", "1/1000", "0")],
-    "1/min": [("1/min|rpm|RPM|Rpm|U/min|Umin|upm|r/min|R/min|min⁻¹|min^-1|/min|rev/min|Unit_MinutInver", "1", "0"),
-              ("rps|1/s|U/sec|s⁻¹", "1/60", "0"), ("deg/s|°/s|degrees/second|Grad/sec|Unit_DegreOfArcPerSecon", "6", "0")],
-    "%": [("%|percent|Percent|Unit_PerCent|pct", "1", "0"), ("1|ratio", "1/100", "0")],
-    "degC": [("degC|DegC|Deg C|deg C|deg_C|°C|° C|ºC|Â°C|\ufffdC|C|Cel|Celsius|celsius|Degrees C|Unit_DegreCelsi|[°C]|Grad C", "1", "0"),
-             ("K|Kelvin|degK|Unit_Kelvi", "1", "273.15"), ("F|degF|°F|Fahrenheit", "9/5", "32")],
+    "V": [
+        ("V|v|Volt|Volts|volt|VOLT|Unit_Volt|[V]|| |-|none|Unit_None|unitless|N/A", "1", "0"),
+        ("mV|mv|Unit_MilliVolt|millivolts|(mV)", "1000", "0"),
+        ("kV|KV", "1/1000", "0"),
+    ],
+    "A": [
+        ("A|Amp|Amps|amps|ampere|Ampere|Unit_Amper|Unit_Ampere", "1", "0"),
+        ("mA|Unit_MilliAmper", "1000", "0"),
+        ("kA", "1/1000", "0"),
+    ],
+    "W": [
+        ("W|watts|Watt|Unit_Watt", "1", "0"),
+        ("kW|KW|kw|Kw|Unit_KiloWatt", "1/1000", "0"),
+        ("mW", "1000", "0"),
+    ],
+    "Wh": [
+        ("Wh", "1", "0"),
+        ("kWh", "1/1000", "0"),
+        ("J", "3600", "0"),
+        ("kJ", "18/5", "0"),
+        ("mWh", "1000", "0"),
+    ],
+    "mAh": [
+        ("mAh|mA*h", "1", "0"),
+        ("Ah|AH|A h|AmpHour|amperehour|ampere*hour|Unit_AmperHour", "1/1000", "0"),
+        ("As|C|coulomb", "18/5", "0"),
+    ],
+    "s": [
+        ("s|sec|secs|Seconds|Unit_Secon", "1", "0"),
+        ("ms", "1000", "0"),
+        ("min", "1/60", "0"),
+        ("h", "1/3600", "0"),
+        ("us", "1000000", "0"),
+    ],
+    "us": [
+        ("us|µs|μs|Âµs|usec|uSec|Unit_MicroSecon|microseconds", "1", "0"),
+        ("ms|msec|mSec|millisecond|Unit_MilliSecon", "1/1000", "0"),
+        ("s", "1/1000000", "0"),
+    ],
+    "ms": [
+        ("ms", "1", "0"),
+        ("s", "1/1000", "0"),
+        ("us", "1000", "0"),
+    ],
+    "Hz": [
+        ("Hz|hz|Unit_Hertz|1/s", "1", "0"),
+        ("kHz", "1/1000", "0"),
+    ],
+    "1/min": [
+        (
+            (
+                "1/min|rpm|RPM|Rpm|U/min|Umin|upm|r/min|R/min|min⁻¹|min^-1|/min|rev/min"
+                "|Unit_MinutInver"
+            ),
+            "1",
+            "0",
+        ),
+        ("rps|1/s|U/sec|s⁻¹", "1/60", "0"),
+        ("deg/s|°/s|degrees/second|Grad/sec|Unit_DegreOfArcPerSecon", "6", "0"),
+    ],
+    "%": [
+        ("%|percent|Percent|Unit_PerCent|pct", "1", "0"),
+        ("1|ratio", "1/100", "0"),
+    ],
+    "degC": [
+        (
+            (
+                "degC|DegC|Deg C|deg C|deg_C|°C|° C|ºC|Â°C|\ufffdC|C|Cel|Celsius|celsius"
+                "|Degrees C|Unit_DegreCelsi|[°C]|Grad C"
+            ),
+            "1",
+            "0",
+        ),
+        ("K|Kelvin|degK|Unit_Kelvi", "1", "273.15"),
+        ("F|degF|°F|Fahrenheit", "9/5", "32"),
+    ],
     "": [("|-|1|count|counts|Cnt|#|Unit_None|number", "1", "0")],
-}  # fmt: skip
+}
 """For the unit of a source, other units with factor and shift.
 
 The value in the other unit is value * factor + shift.
@@ -241,23 +378,27 @@ class Sig:
 
     @property
     def line(self) -> str:
-        sign, order = "-" if self.signed else "+", 1 if self.little else 0
+        sign = "-" if self.signed else "+"
+        order = 1 if self.little else 0
         mux = f" {self.mux}" if self.mux else ""
-        return (
-            f" SG_ {self.name}{mux} : {self.start}|{self.length}@{order}{sign} ({self.factor},{self.offset})"
-            f' [{self.minimum}|{self.maximum}] "{self.unit}" Logger'
-        )
+        place = f"{self.start}|{self.length}@{order}{sign}"
+        scale = f"({self.factor},{self.offset})"
+        limits = f"[{self.minimum}|{self.maximum}]"
+        return f' SG_ {self.name}{mux} : {place} {scale} {limits} "{self.unit}" Logger'
 
     @property
     def range(self) -> tuple[int, int]:
-        return (
-            (-(1 << self.length - 1), (1 << self.length - 1) - 1)
-            if self.signed
-            else (0, (1 << self.length) - 1)
-        )
+        """Smallest and greatest raw value."""
+        codes = 1 << self.length
+        if self.signed:
+            return -(codes // 2), codes // 2 - 1
+        return 0, codes - 1
 
     def code(self, text: str) -> int | None:
-        return next((number for number, name in self.texts.items() if name == text), None)
+        for number, name in self.texts.items():
+            if name == text:
+                return number
+        return None
 
     @property
     def not_available(self) -> int:
@@ -279,11 +420,14 @@ class Sig:
     def limits(self) -> tuple[int, int]:
         """Smallest and greatest raw value that is not a code."""
         low, high = self.range
-        factor, offset = Fraction(self.factor), Fraction(self.offset)
-        least, most = Fraction(self.minimum), Fraction(self.maximum)
+        factor = Fraction(self.factor)
+        offset = Fraction(self.offset)
+        least = Fraction(self.minimum)
+        most = Fraction(self.maximum)
         if least or most:
             ends = sorted(((least - offset) / factor, (most - offset) / factor))
-            low, high = max(low, math.ceil(ends[0])), min(high, math.floor(ends[1]))
+            low = max(low, math.ceil(ends[0]))
+            high = min(high, math.floor(ends[1]))
         codes = {self.code("NotAvailable"), self.code("Error")}
         while high in codes:
             high -= 1
@@ -294,19 +438,22 @@ class Sig:
     def physical(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction | None:
         """Return the value in the signal's unit."""
         value = KNOWN[self.source].read(esc, gateway, now)
-        return (
-            None
-            if value is None
-            else value * Fraction(self.conversion[0]) + Fraction(self.conversion[1])
-        )
+        if value is None:
+            return None
+        factor, shift = self.conversion
+        return value * Fraction(factor) + Fraction(shift)
 
     def right(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> int:
         """Return the correct raw value: the nearest one, halves up."""
-        known, value = KNOWN[self.source], self.physical(esc, gateway, now)
+        known = KNOWN[self.source]
+        value = self.physical(esc, gateway, now)
         if value is None:
             return self.not_available
         codes = {plain(name): code for code, name in self.texts.items()}
-        by_text = {n: codes[plain(t)] for n, t in known.names.items() if plain(t) in codes}
+        by_text = {}
+        for number, text in known.names.items():
+            if plain(text) in codes:
+                by_text[number] = codes[plain(text)]
         if by_text:
             return by_text.get(int(value), self.error)
         low, high = self.limits
@@ -315,7 +462,9 @@ class Sig:
         exact = (value - Fraction(self.offset)) / Fraction(self.factor)
         raw = math.floor(exact + Fraction(1, 2))
         looks_like_none = raw == self.not_available and self.length > 1
-        return raw if low <= raw <= high and not looks_like_none else self.error
+        if low <= raw <= high and not looks_like_none:
+            return raw
+        return self.error
 
     def float_is_right(self, raw: int, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> bool:
         """Return True if the IEEE 754 bits are correct, within the rounding of double and type.
@@ -327,12 +476,17 @@ class Sig:
         value = self.physical(esc, gateway, now)
         if value is None:
             return math.isnan(sent)
-        exact = (value - Fraction(self.offset)) / Fraction(self.factor)
-        if math.isnan(sent) or math.isinf(sent):
-            return math.isnan(sent) and self.length == 32 and abs(exact) > Fraction(3.4028234e38)
-        shifts = (Fraction(self.offset) / Fraction(self.factor), Fraction(self.conversion[1]))
-        size = max(abs(each) for each in (exact, *shifts))
-        rounding = abs(exact) * Fraction(2) ** (-24 if self.length == 32 else -52)
+        factor = Fraction(self.factor)
+        offset = Fraction(self.offset)
+        exact = (value - offset) / factor
+        if math.isnan(sent):
+            return self.length == 32 and abs(exact) > Fraction(3.4028234e38)
+        if math.isinf(sent):
+            return False
+        shift = Fraction(self.conversion[1])
+        size = max(abs(exact), abs(offset / factor), abs(shift))
+        bits = 24 if self.length == 32 else 52
+        rounding = abs(exact) / Fraction(2) ** bits
         return abs(Fraction(sent) - exact) <= rounding + size / 10**14 + Fraction(1, 10**40)
 
 
@@ -358,8 +512,10 @@ class Msg:
 
     @property
     def pages(self) -> list[int | None]:
-        pages: set[int] = {int(s.mux[1:]) for s in self.signals if s.mux.startswith("m")}
-        return [*sorted(pages)] if pages else [None]
+        multiplexed = [signal for signal in self.signals if signal.mux.startswith("m")]
+        if not multiplexed:
+            return [None]
+        return [*sorted({int(signal.mux[1:]) for signal in multiplexed})]
 
     def page_of(self, number: int | None) -> list[Sig]:
         """Return the signals in a frame of this page."""
@@ -368,7 +524,8 @@ class Msg:
 
 ATTRIBUTES = """BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
 BA_DEF_ BO_ "GenMsgDelayTime" INT 0 65535;
-BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange","None","Wrong";
+BA_DEF_ BO_ "GenMsgSendType" ENUM
+ "Cyclic","Event","OnChange","CyclicAndEvent","CyclicAndOnChange","None","Wrong";
 BA_DEF_ SG_ "GenSigStartValue" FLOAT -9223372036854775808 18446744073709551615;
 BA_DEF_DEF_ "GenMsgCycleTime" 0;
 BA_DEF_DEF_ "GenMsgDelayTime" 0;
@@ -385,20 +542,18 @@ def dbc_text(messages: Iterable[Msg], more: str = "") -> str:
         lines += [*(signal.line for signal in message.signals), ""]
     lines.append(ATTRIBUTES)
     pairs = [(message.dbc_id, signal) for message in messages for signal in message.signals]
-    lines += [
-        f'BA_ "GenSigStartValue" SG_ {can_id} {signal.name} {signal.start_value};'
-        for can_id, signal in pairs
-        if signal.start_value is not None
-    ]
+    for can_id, signal in pairs:
+        if signal.start_value is not None:
+            value = signal.start_value
+            lines.append(f'BA_ "GenSigStartValue" SG_ {can_id} {signal.name} {value};')
     lines.append(more)
     for can_id, signal in pairs:
         if signal.texts:
             texts = " ".join(f'{number} "{text}"' for number, text in signal.texts.items())
             lines.append(f"VAL_ {can_id} {signal.name} {texts} ;")
         if signal.is_float:
-            lines.append(
-                f"SIG_VALTYPE_ {can_id} {signal.name} : {1 if signal.length == 32 else 2};"
-            )
+            kind = 1 if signal.length == 32 else 2
+            lines.append(f"SIG_VALTYPE_ {can_id} {signal.name} : {kind};")
     return "\n".join(lines) + "\n"
 
 
@@ -411,18 +566,19 @@ def read(text: str) -> Database:
 
 def bindings(messages: Iterable[Msg]) -> dict[str, str | float]:
     """Return the bindings that the messages need in ``[dbc.bind]``."""
-    return {
-        f"{message.name}.{signal.name}": signal.bind
-        for message in messages
-        for signal in message.signals
-        if signal.bind is not None
-    }
+    found: dict[str, str | float] = {}
+    for message in messages:
+        for signal in message.signals:
+            if signal.bind is not None:
+                found[f"{message.name}.{signal.name}"] = signal.bind
+    return found
 
 
 # --- random layouts
 
 FACTORS = [
-    "1", "1", "1", "0.1", "0.01", "0.001", "0.5", "2", "5", "-1", "-0.1", "0.25", "0.0625", "100", "3", "0.3", "-7",
+    "1", "1", "1", "0.1", "0.01", "0.001", "0.5", "2", "5",
+    "-1", "-0.1", "0.25", "0.0625", "100", "3", "0.3", "-7",
 ]  # fmt: skip
 OFFSETS = ["0", "0", "0", "0", "-40", "100", "0.5", "-273.15", "1000", "-0.05", "32768"]
 
@@ -441,7 +597,9 @@ class LayoutMaker:
     """Makes random messages with signals that are bound to random sources of the ESCs."""
 
     def __init__(self, rng: random.Random, escs: Sequence[EscSettings], fd: bool = True) -> None:
-        self.rng, self.escs, self.fd = rng, escs, fd
+        self.rng = rng
+        self.escs = escs
+        self.fd = fd
         self.ids: set[tuple[int, bool]] = set()
         self.count = 0
 
@@ -461,16 +619,7 @@ class LayoutMaker:
         common: set[tuple[int, int]] = set()
         wanted = rng.randint(1, 8)
         if rng.random() < 0.2:
-            width = rng.randint(1, 8)
-            if (selector := self._position(common, width, length)) is not None:
-                message.signals.append(Sig("Selector", selector[0], width, selector[1], mux="M"))
-                used: set[tuple[int, int]] = set()
-                for page in rng.sample(range(1 << width), min(1 << width, rng.randint(1, 3))):
-                    taken = set(common)  # pages may overlap
-                    for _ in range(rng.randint(1, 3)):
-                        self._add(message, taken, f"m{page}")
-                    used |= taken
-                common |= used
+            self._add_pages(message, common)
         for _ in range(wanted):
             self._add(message, common, "")
         if not message.signals or all(s.mux == "M" for s in message.signals):
@@ -479,14 +628,34 @@ class LayoutMaker:
             return self.message()
         return message
 
+    def _add_pages(self, message: Msg, common: set[tuple[int, int]]) -> None:
+        """Add a selector and the signals of 1 to 3 pages, if there is a place for the selector."""
+        rng = self.rng
+        width = rng.randint(1, 8)
+        place = self._position(common, width, message.length)
+        if place is None:
+            return
+        start, little = place
+        message.signals.append(Sig("Selector", start, width, little, mux="M"))
+        numbers = range(1 << width)
+        used: set[tuple[int, int]] = set()
+        for page in rng.sample(numbers, min(len(numbers), rng.randint(1, 3))):
+            taken = set(common)  # pages may overlap
+            for _ in range(rng.randint(1, 3)):
+                self._add(message, taken, f"m{page}")
+            used |= taken
+        common |= used
+
     def _position(
         self, taken: set[tuple[int, int]], width: int, length: int
     ) -> tuple[int, bool] | None:
         rng = self.rng
         for _ in range(12):
-            start, little = rng.randrange(length * 8), rng.random() < 0.5
+            start = rng.randrange(length * 8)
+            little = rng.random() < 0.5
             places = bit_places(start, width, little)
-            if all(0 <= byte < length for byte, _ in places) and not taken & set(places):
+            is_inside = all(0 <= byte < length for byte, _ in places)
+            if is_inside and not taken & set(places):
                 taken.update(places)
                 return start, little
         return None
@@ -502,21 +671,32 @@ class LayoutMaker:
         length = rng.choice((32, 64) if is_float else lengths)
         if length == 1 and (signed or not is_number):
             length = 8
-        if (place := self._position(taken, length, message.length)) is None:
+        place = self._position(taken, length, message.length)
+        if place is None:
             return
+        start, little = place
         name = f"S{len(message.signals)}"
-        signal = Sig(name, place[0], length, place[1], signed, is_float, mux=mux, source=source)
+        signal = Sig(name, start, length, little, signed, is_float, mux=mux, source=source)
         signal.esc = rng.randrange(len(self.escs))
-        texts, *conversion = rng.choice(UNITS[known.unit])
+        texts, factor, shift = rng.choice(UNITS[known.unit])
         signal.unit = rng.choice(texts.split("|"))
-        signal.conversion = conversion[0], conversion[1]
+        signal.conversion = (factor, shift)
         if is_number and length > 1:
-            signal.factor, signal.offset = rng.choice(FACTORS), rng.choice(OFFSETS)
+            signal.factor = rng.choice(FACTORS)
+            signal.offset = rng.choice(OFFSETS)
         if not is_float and length > 1:
             self._codes(signal, known)
             if not known.names:
                 self._limits(signal, known)
-        prefix = "" if known.gateway else self.escs[signal.esc].name
+        self._name(message, signal)
+        message.signals.append(signal)
+
+    def _name(self, message: Msg, signal: Sig) -> None:
+        """Give a signal the name of its source in a random style, or bind it to the source."""
+        rng = self.rng
+        source = signal.source
+        number_name = signal.name
+        prefix = "" if KNOWN[source].gateway else self.escs[signal.esc].name
         if rng.random() < 0.3:
             own = f"{prefix}_{source}".strip("_")
             name = pascal(own) if rng.random() < 0.5 else spelled(rng, own)
@@ -524,15 +704,15 @@ class LayoutMaker:
                 name += "Percent"
             if all(s.name != name for s in message.signals):
                 signal.name = name
-        if signal.name == f"S{len(message.signals)}":
+        if signal.name == number_name:
             signal.bind = f"{prefix}.{source}" if prefix else source
-        message.signals.append(signal)
 
     def _codes(self, signal: Sig, known: Known) -> None:
         rng = self.rng
         low, high = signal.range
         usual = (low, low + 1) if signal.signed else (high, high - 1)
-        free = [code for code in range(low, min(high, low + 4000) + 1) if code not in usual]
+        last = min(high, low + 4000)
+        free = [code for code in range(low, last + 1) if code not in usual]
         if known.names and rng.random() < 0.7 and len(free) >= len(known.names):
             codes = rng.sample(free, len(known.names))
             for text, code in zip(known.names.values(), codes, strict=True):
@@ -560,9 +740,11 @@ class LayoutMaker:
             ends = [0, rng.randint(max(1, high // 2), high)]
         else:
             ends = sorted((rng.randint(low, high), rng.randint(low, high)))
-        factor, offset = Decimal(signal.factor), Decimal(signal.offset)
+        factor = Decimal(signal.factor)
+        offset = Decimal(signal.offset)
         least, most = sorted(end * factor + offset for end in ends)
-        signal.minimum, signal.maximum = str(least), str(most)
+        signal.minimum = str(least)
+        signal.maximum = str(most)
 
 
 # --- random telemetry
@@ -571,9 +753,8 @@ class LayoutMaker:
 def random_integer(rng: random.Random, low: int, high: int) -> int:
     """Return a limit or a neighbour of zero often, otherwise any integer in the range."""
     if rng.random() < 0.3:
-        return rng.choice(
-            [v for v in (low, low + 1, -1, 0, 1, 99, 100, high - 1, high) if low <= v <= high]
-        )
+        often = (low, low + 1, -1, 0, 1, 99, 100, high - 1, high)
+        return rng.choice([value for value in often if low <= value <= high])
     if rng.random() < 0.5:
         return rng.randint(max(low, -200), min(high, 3000))
     return rng.randint(low, high)
@@ -608,21 +789,24 @@ def random_escs(
     for _ in range(rng.randint(0, 3)):
         for esc in escs:
             layout = rng.choice((Layout.V4, Layout.LEGACY))
-            kind = rng.random()
-            if kind < 0.7:
-                list(esc.receive_each(encode(random_live(rng), layout), now, now))
+            if rng.random() < 0.7:
+                live = encode(random_live(rng), layout)
+                list(esc.receive_each(live, now, now))
             if rng.random() < 0.4:
-                list(esc.receive_each(encode(random_info(rng), layout), now, now))
+                info = encode(random_info(rng), layout)
+                list(esc.receive_each(info, now, now))
             if rng.random() < 0.2:
-                list(esc.receive_each(rng.randbytes(rng.randint(1, 50)), now, now))
+                noise = rng.randbytes(rng.randint(1, 50))
+                list(esc.receive_each(noise, now, now))
         now += rng.choice((1, 10, 33, 200)) * MS + rng.randrange(MS)
     if rng.random() < 0.15:
         now += 400 * MS
     for esc in escs:
         esc.advance(now)
         if rng.random() < 0.3:
-            energy = rng.choice((1, -1)) * rng.randrange(10 ** rng.choice((17, 19)))
-            esc.energy_mw_ns = energy * SECOND
+            sign = rng.choice((1, -1))
+            most = 10 ** rng.choice((17, 19))
+            esc.energy_mw_ns = sign * rng.randrange(most) * SECOND
             esc.run_time_ns = rng.randrange(10**14)
             esc.losses = rng.randrange(10**6)
             esc.frame_rate = rng.choice((None, 0, 5, 999, 1004))
@@ -634,7 +818,7 @@ def random_gateway(rng: random.Random, now: int) -> GatewayStatus:
     status = GatewayStatus(*states, rng.randint(0, 9), rng.randint(0, 9))
     status.started_ns = now - rng.randrange(10**14)
     status.sent_frames = rng.randrange(10**10)
-    for name in (name for name, known in KNOWN.items() if known.gateway and known.rolls):
-        if name != "sent_frames":
+    for name, known in KNOWN.items():
+        if known.gateway and known.rolls and name != "sent_frames":
             setattr(status, name, rng.randrange(100000))
     return status

@@ -25,8 +25,9 @@ def wanted(plan: SignalPlan, raw: Any, bits: int) -> Any:
     """Return the value for the raw number that cantools decodes."""
     codes = (plan.not_available, plan.error)
     if plan.is_float:
-        is_none = bits in codes or raw != raw
-        return None if is_none else raw * float(plan.factor) + float(plan.offset)
+        if bits in codes or raw != raw:
+            return None
+        return raw * float(plan.factor) + float(plan.offset)
     as_it_stands = plan.numbers is None and plan.factor == 1 and plan.offset == 0
     if raw in codes and not (plan.length == 1 and not plan.signed and as_it_stands):
         return None
@@ -43,53 +44,81 @@ def test_random_frames_are_decoded_as_cantools_does(seed: int) -> None:
     maker = LayoutMaker(rng, ESCS)
     messages = [maker.message() for _ in range(MESSAGES)]
     database = read(dbc_text(messages))
-    layout = prepare(
-        database, "random.dbc", ESCS, DbcConfig(bind=bindings(messages)), fd_allowed=True
-    )
+    settings = DbcConfig(bind=bindings(messages))
+    layout = prepare(database, "random.dbc", ESCS, settings, fd_allowed=True)
     reader = SignalReader(layout)
     compared = 0
     for message, plan in zip(messages, layout.messages, strict=True):
         theirs = database.get_message_by_name(message.name)
-        key = message.can_id | (EXTENDED if message.extended else 0)
         for _ in range(8):
-            fills = rng.randbytes(message.length), bytes(message.length), b"\xff" * message.length
-            data, page = bytearray(rng.choice(fills)), rng.choice(message.pages)
-            selector = next((s for s in message.signals if s.mux == "M"), None)
-            if selector is not None:
-                for byte, bit in bit_places(selector.start, selector.length, selector.little):
-                    data[byte] &= ~(1 << bit)
-                put(data, page or 0, selector.start, selector.length, selector.little)
-            got = {
-                reader.columns[first + n].name: value
-                for first, values in reader.read(key, bytes(data)) or ()
-                for n, value in enumerate(values)
-            }
-            made = {s.name: s for s in message.page_of(page) if s is not selector}
-            assert set(got) == set(made)
-            raws: Any = theirs.decode(bytes(data), decode_choices=False, scaling=False)
+            data, page = random_frame(rng, message)
+            got = values_of(reader, message, data)
+            raws: Any = theirs.decode(data, decode_choices=False, scaling=False)
             planned = {s.name: s for s in plan.signals if s.page in (None, page)}
-            for name, value in got.items():
-                own, place = planned[name], made[name]
-                bits = get(bytes(data), place.start, place.length, place.little)
-                expected = wanted(own, raws[name], bits)
-                if value is None and own.length == 1 and expected is not None:
-                    # The other values of the same UART frame are not available either.
-                    beside = [planned[n] for n, v in got.items() if v is None and n != name]
-                    assert any(s.length > 1 and same_frame(s, own) for s in beside)
-                elif isinstance(expected, float) and isinstance(value, float):
-                    assert math.isclose(value, expected, rel_tol=1e-12), (message.name, name)
-                else:
-                    assert value == expected, (message.name, name)
-                compared += 1
+            check_values(message, page, planned, got, data, raws)
+            compared += len(got)
     assert compared > 300
+
+
+def random_frame(rng: random.Random, message: Msg) -> tuple[bytes, int | None]:
+    """Return the data of a frame, and its page."""
+    size = message.length
+    fills = rng.randbytes(size), bytes(size), b"\xff" * size
+    data = bytearray(rng.choice(fills))
+    page = rng.choice(message.pages)
+    for selector in message.signals:
+        if selector.mux == "M":
+            for byte, bit in bit_places(selector.start, selector.length, selector.little):
+                data[byte] &= ~(1 << bit)
+            put(data, page or 0, selector.start, selector.length, selector.little)
+    return bytes(data), page
+
+
+def values_of(reader: SignalReader, message: Msg, data: bytes) -> dict[str, Any]:
+    """Return the values of a frame by the names of its signals."""
+    key = message.can_id | (EXTENDED if message.extended else 0)
+    found = {}
+    for first, values in reader.read(key, data) or ():
+        columns = reader.columns[first : first + len(values)]
+        for column, value in zip(columns, values, strict=True):
+            found[column.name] = value
+    return found
+
+
+def check_values(
+    message: Msg,
+    page: int | None,
+    planned: dict[str, SignalPlan],
+    got: dict[str, Any],
+    data: bytes,
+    raws: Any,
+) -> None:
+    """Compare the values of a frame with the raw numbers that cantools decodes."""
+    made = {signal.name: signal for signal in message.page_of(page) if signal.mux != "M"}
+    assert set(got) == set(made)
+    missing = [planned[name] for name, value in got.items() if value is None]
+    for name, value in got.items():
+        own = planned[name]
+        place = made[name]
+        bits = get(data, place.start, place.length, place.little)
+        expected = wanted(own, raws[name], bits)
+        if value is None and own.length == 1 and expected is not None:
+            # The other values of the same UART frame are not available either.
+            others = [signal for signal in missing if signal.length > 1]
+            assert any(same_frame(other, own) for other in others)
+        elif isinstance(expected, float) and isinstance(value, float):
+            assert math.isclose(value, expected, rel_tol=1e-12), (message.name, name)
+        else:
+            assert value == expected, (message.name, name)
 
 
 def same_frame(one: SignalPlan, other: SignalPlan) -> bool:
     """Return True if both are on the same page and from the same kind of UART frame of an ESC."""
     assert one.source is not None
     assert other.source is not None
-    mine, its = (one.page, one.esc, one.source.group), (other.page, other.esc, other.source.group)
-    return mine == its
+    if one.source.group != other.source.group:
+        return False
+    return (one.page, one.esc) == (other.page, other.esc)
 
 
 def test_error_code_of_another_signal_does_not_hide_flags() -> None:
@@ -106,20 +135,22 @@ def test_error_code_of_another_signal_does_not_hide_flags() -> None:
 
 def view_of(*messages: tuple[str, int, str]) -> View:
     """Return a view of messages with one signal each, given by name, cycle in ms, send type."""
-    made = [
-        Msg(f"M{number}", 100 + number, 8, [Sig(name, 0, 16, maximum="65533")])
-        for number, (name, _, _) in enumerate(messages)
-    ]
+    made = []
+    for number, (name, _, _) in enumerate(messages):
+        signal = Sig(name, 0, 16, maximum="65533")
+        made.append(Msg(f"M{number}", 100 + number, 8, [signal]))
     kinds = {"Cyclic": 0, "Event": 1, "OnChange": 2}
-    more = "".join(
-        f'BA_ "GenMsgCycleTime" BO_ {100 + number} {cycle};\nBA_ "GenMsgSendType" BO_ {100 + number} {kinds[send]};\n'
-        for number, (_, cycle, send) in enumerate(messages)
-    )
-    return View(SignalReader(compiled(dbc_text(made, more))))
+    more = ""
+    for can_id, (_, cycle, send) in enumerate(messages, 100):
+        more += f'BA_ "GenMsgCycleTime" BO_ {can_id} {cycle};\n'
+        more += f'BA_ "GenMsgSendType" BO_ {can_id} {kinds[send]};\n'
+    layout = compiled(dbc_text(made, more))
+    return View(SignalReader(layout))
 
 
 def value(view: View, source: str) -> Any:
-    return dict(zip((c.source for c in view.reader.columns), view.values, strict=True))[source]
+    sources = [column.source for column in view.reader.columns]
+    return view.values[sources.index(source)]
 
 
 def test_slow_message_is_fresh_for_three_of_its_cycles() -> None:
