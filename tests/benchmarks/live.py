@@ -88,7 +88,8 @@ def cpu(context: Context) -> list[Figure]:
 
 def canopen(context: Context) -> list[Figure]:
     """CPU time at 8 ESCs with CANopen nodes and default PDOs, and without them, by turns."""
-    plain, both = [], []
+    plain = []
+    both = []
     for _ in range(context.rounds):
         plain.append(once(context, "ours", 8))
         both.append(once(context, "ours", 8, config=CANOPEN))

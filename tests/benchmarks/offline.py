@@ -141,7 +141,8 @@ def captures(context: Context) -> list[Figure]:
 def can_logs(context: Context) -> list[Figure]:
     """An hour's candump log of one ESC as a table and as a page, compared with its capture."""
     seconds = 60 if context.quick else 3600
-    source, log = capture(context, seconds), context.folder / f"log-{seconds}.log"
+    source = capture(context, seconds)
+    log = context.folder / f"log-{seconds}.log"
     convert(context, "candump", source)
     (context.folder / "converted.log").replace(log)
     hours = seconds / 3600

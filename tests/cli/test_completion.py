@@ -14,7 +14,8 @@ from kontronik_can_gw.cli import COMMANDS
 def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the script for bash into a folder with some files."""
     done = run("completion", "bash")
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0
+    assert done.err == ""
     folder = tmp_path_factory.mktemp("completion")
     for name in ("car.toml", "car.dbc", "car.bin"):
         (folder / name).touch()
@@ -55,7 +56,8 @@ def test_bash_completes_commands_options_choices_and_files_of_the_right_kind(
 @pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
 def test_each_shell_has_a_completion_script(shell: str) -> None:
     done = run("completion", shell)
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0
+    assert done.err == ""
     assert all(command in done.out for command in COMMANDS)
     if interpreter := shutil.which(shell):
         subprocess.run([interpreter, "-n"], input=done.data, check=True, timeout=60)

@@ -102,7 +102,8 @@ def no_rights(folder: Path) -> Iterator[None]:
 
 def refused(code: int, words: str, name: str) -> None:
     done = run(*words.split())
-    assert (done.code, "Traceback" in done.err) == (code, False), done
+    assert done.code == code, done
+    assert "Traceback" not in done.err, done
     said = done.err + (done.out if words.startswith("doctor") else "")
     assert name in said, said
     assert words.startswith("doctor") or done.out == ""

@@ -34,7 +34,8 @@ EVERY = list(parsers(make_parser()))
 def test_help_fits_80_columns_and_has_a_description(parser: argparse.ArgumentParser) -> None:
     text = parser.format_help()
     assert [line for line in text.splitlines() if len(line) > 80] == []
-    assert parser.description and parser.description.endswith(".")
+    assert parser.description
+    assert parser.description.endswith(".")
     assert not re.search(r"  the same$|^The same as", text, re.MULTILINE), "before its referent"
 
 
@@ -84,9 +85,11 @@ def test_a_mistyped_command_line_shows_usage_and_suggestion(
     words: str, usage: str, said: str
 ) -> None:
     done = run(*words.split())
-    assert (done.code, done.out) == (2, "")
+    assert done.code == 2
+    assert done.out == ""
     assert done.err.startswith(f"usage: kontronik-can-gw{usage} [-h] ")
-    assert f"kontronik-can-gw{usage}: error: " in done.err and said in done.err
+    assert f"kontronik-can-gw{usage}: error: " in done.err
+    assert said in done.err
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -102,6 +105,7 @@ def test_an_unknown_option_shows_the_usage_of_the_command(name: str) -> None:
     }
     done = run(name, *required.get(name, []), "--no-such-option")
     place = f"{name} install" if name == "service" else name
-    assert (done.code, done.out) == (2, "")
+    assert done.code == 2
+    assert done.out == ""
     assert done.err.startswith(f"usage: kontronik-can-gw {place} [-h]")
     assert "unrecognized arguments: --no-such-option" in done.err

@@ -52,7 +52,8 @@ def test_a_file_that_exists_is_replaced_only_with_force(command: str, folder: Pa
     assert len(first) > 100
     written(folder / "out", "precious")
     done = run(*words)
-    assert (done.code, done.out) == (2, "")
+    assert done.code == 2
+    assert done.out == ""
     assert "out: exists. Give another name, or --force to replace it." in done.err
     assert (folder / "out").read_text() == "precious"
     assert run(*words, "--force").code == 0
@@ -65,9 +66,12 @@ def test_an_output_that_cannot_be_written_leaves_no_file(command: str, folder: P
     before = names(folder)
     for output, code in (("none/out", 1), ("x.bin/out", 1), (".", 2)):
         done = run(*command.format(o=output).split(), "--force")
-        assert (done.code, done.out, "Traceback" in done.err) == (code, "", False), done
+        assert done.code == code, done
+        assert done.out == "", done
+        assert "Traceback" not in done.err, done
         said = done.err.splitlines()[-1]
-        assert output in said and ("cannot be written" in said if code == 1 else "folder" in said)
+        assert output in said
+        assert "cannot be written" in said if code == 1 else "folder" in said
     assert names(folder) == before
 
 
@@ -96,7 +100,8 @@ def test_an_input_is_never_overwritten(command: str, source: str, way: str, fold
     written(folder / "nodes.toml", nodes)
     (folder / "captures").mkdir()
     written(folder / "captures" / "a-1.kcap", b"KCB1")
-    path, output = folder / source, folder / "out"
+    path = folder / source
+    output = folder / "out"
     if way == "name":
         output = path
     elif way == "symbolic link":
@@ -107,7 +112,8 @@ def test_an_input_is_never_overwritten(command: str, source: str, way: str, fold
         os.link(path, folder / "out.part")
     before = path.read_bytes()
     done = run(*command.format(o=output).split(), "--force")
-    assert (done.code, done.out) == (2, "")
+    assert done.code == 2
+    assert done.out == ""
     assert f"{output}: would write over the input" in done.err
     assert path.read_bytes() == before
 
@@ -116,13 +122,15 @@ def test_an_export_replaces_files_only_with_force_and_never_its_input(folder: Pa
     assert run("export", "c", "-o", "fw").code == 0
     (folder / "fw" / "example_main.c").write_text("mine")
     done = run("export", "c", "--dbc", "own.dbc", "fw")
-    assert done.code == 2 and done.err.count(": exists. Give another name, or --force") == 6
+    assert done.code == 2
+    assert done.err.count(": exists. Give another name, or --force") == 6
     assert run("export", "c", "--dbc", "own.dbc", "fw", "--force").code == 0
     assert (folder / "fw" / "example_main.c").read_text() == "mine"
     (folder / "fw" / "core.h").unlink()
     (folder / "fw" / "core.h").symlink_to(folder / "own.dbc")
     done = run("export", "c", "--dbc", "own.dbc", "fw", "--force")
-    assert done.code == 2 and "fw/core.h: would write over the input own.dbc" in done.err
+    assert done.code == 2
+    assert "fw/core.h: would write over the input own.dbc" in done.err
     assert (folder / "own.dbc").read_text().startswith("VERSION")
 
 
@@ -140,11 +148,13 @@ def test_a_signal_leaves_no_partly_written_file(number: int, folder: Path) -> No
         end = time.monotonic() + 60
         part = folder / "long.bin.part"
         while not (part.exists() and part.stat().st_size):
-            assert process.poll() is None and time.monotonic() < end
+            assert process.poll() is None
+            assert time.monotonic() < end
             time.sleep(0.02)
         process.send_signal(number)
         _, said = process.communicate(timeout=60)
-    assert (process.returncode, said) == (130, "")
+    assert process.returncode == 130
+    assert said == ""
     assert names(folder) == before
 
 
@@ -159,6 +169,8 @@ def test_a_full_disk_leaves_no_partly_written_file(
     for command in COMMANDS:
         done = run(*command.format(o="out").split())
         said = [line for line in done.err.splitlines() if ": by gateway.toml" not in line]
-        assert (done.code, done.out, len(said)) == (1, "", 1), done
+        assert done.code == 1, done
+        assert done.out == "", done
+        assert len(said) == 1, done
         assert "out: cannot be written: No space left on device." in said[0]
     assert names(folder) == before

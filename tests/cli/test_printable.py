@@ -119,5 +119,6 @@ def test_error_messages_about_hostile_files_are_cleaned(
     path = tmp_path / name
     path.write_text(content)
     done = run(*words.split(), path)
-    assert done.code and "usage:" not in done.err
+    assert done.code
+    assert "usage:" not in done.err
     assert is_clean(done.out + done.err)

@@ -69,11 +69,14 @@ def test_an_ignored_ctrl_c_does_not_end_the_program(folder: Path) -> None:
     code = "import signal; signal.signal(2, signal.SIG_IGN)\n" + INTERRUPTED
     code = code.format(module="kontronik_can_gw.cli", words=["schema"], start=AS_MODULE, loaded=[])
     done = run(sys.executable, "-c", code, folder=folder)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0
+    assert done.stderr == ""
 
 
 def test_too_few_open_files_are_reported_in_one_line(folder: Path) -> None:
     command = [sys.executable, "-m", "kontronik_can_gw", "simulate", "--esc", "40"]
     done = run("sh", "-c", LIMITED, "40", *command, folder=folder)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
     assert "Too many open files" in done.stderr

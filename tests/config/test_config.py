@@ -261,7 +261,8 @@ def accepted(made: Any) -> Config | None:
 def test_schema_describes_every_key_with_the_default_of_the_parser() -> None:
     jsonschema.Draft202012Validator.check_schema(schema())
     config = parse(tables(), "folder/a.toml")
-    assert config.dbc_path == shipped("dbc/kontronik_esc.dbc") and config.dbc_path.is_file()
+    assert config.dbc_path == shipped("dbc/kontronik_esc.dbc")
+    assert config.dbc_path.is_file()
     mine = parse(tables("dbc", "file", "my.dbc"), "folder/a.toml")
     assert mine.dbc_path == Path("folder/my.dbc")
     for table, keys in KEYS.items():
@@ -309,7 +310,8 @@ def given(table: str, key: str) -> list[tuple[bool | None, Any]]:
     found += [(True, value) for value in entry.get("enum", ())]
     found += [(True, value) for value in TAKEN.get((table, key), ())]
     if "minimum" in entry:
-        low, high = entry["minimum"], entry["maximum"]
+        low = entry["minimum"]
+        high = entry["maximum"]
         found += [(True, low), (True, high), (False, low - 1), (False, high + 1)]
     return found
 
@@ -346,7 +348,8 @@ def check_toml(config: Config) -> None:
     """Check that the effective configuration as TOML is equal when it is read again."""
     text = as_toml(config)
     again = parse(tomllib.loads(text), config.file)
-    assert again == config and as_toml(again) == text
+    assert again == config
+    assert as_toml(again) == text
 
 
 def test_any_text_can_be_written_as_toml() -> None:

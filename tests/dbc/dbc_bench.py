@@ -28,7 +28,8 @@ def check_comments(database: Database) -> None:
         owners += message.signals
     for owner in owners:
         text = str(owner.comment)
-        assert len(text) >= 10 and text.endswith("."), text
+        assert len(text) >= 10, text
+        assert text.endswith("."), text
         assert not re.search(r"[;\\]|\b[A-Z]+_\B", text), text
 
 
@@ -51,8 +52,10 @@ def refused(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> lis
     lines = list(caught.value.problems)
     assert lines
     for line in lines:
-        assert line.startswith((f"{FILE}: ", "dbc.")) and FILE in line, line
-        assert "\n" not in line and len(line) < 600, line
+        assert line.startswith((f"{FILE}: ", "dbc.")), line
+        assert FILE in line, line
+        assert "\n" not in line, line
+        assert len(line) < 600, line
     return lines
 
 

@@ -66,9 +66,11 @@ def float_of(signal: Sig, bind: float | None = None, live: LiveData = LIVE) -> f
 def test_a_longer_prefix_wins_over_a_shorter_one_and_a_source_over_a_prefix() -> None:
     binder = Binder([EscSettings("left"), EscSettings("left_rear"), EscSettings("l")], {})
     found = binder.by_name("LeftRearBatteryVoltage")
-    assert found is not None and found[1] == 1
+    assert found is not None
+    assert found[1] == 1
     found = Binder([EscSettings("max")], {}).by_name("MaxBatteryVoltage")
-    assert found is not None and found[0].name == "max_battery_voltage"
+    assert found is not None
+    assert found[0].name == "max_battery_voltage"
 
 
 # --- [dbc.bind]

@@ -84,7 +84,9 @@ def prepared(database: Database, file: str, **settings: Any) -> tuple[Layout | N
         return prepare(database, file, escs, DbcConfig(**settings), True), []
     except UserError as error:
         for line in error.problems:
-            assert line.startswith((file, "dbc.")) and "\n" not in line and len(line) < 600
+            assert line.startswith((file, "dbc."))
+            assert "\n" not in line
+            assert len(line) < 600
         return None, list(error.problems)
 
 
@@ -94,7 +96,9 @@ def check_file(file: Path) -> None:
         database = load_database(file)
     except UserError as error:
         (line,) = error.problems
-        assert name in line and "\n" not in line and len(line) < 600
+        assert name in line
+        assert "\n" not in line
+        assert len(line) < 600
         return
     nodes: set[str] = set()
     for message in database.messages:

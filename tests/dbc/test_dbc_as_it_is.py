@@ -93,8 +93,10 @@ def test_an_entry_for_a_missing_object_is_ignored_with_a_warning(entry: str, wor
     text = f'{STATE}CM_ SG_ 256 OperatingState "{comment}";\n{entry}\n'
     (message,) = parse_database(text.encode(), "my.dbc", warnings).messages
     (line,) = warnings
-    assert line.startswith("my.dbc: ignored") and line.endswith(words)
-    assert message.signals[0].choices is None and message.signals[0].comment == comment
+    assert line.startswith("my.dbc: ignored")
+    assert line.endswith(words)
+    assert message.signals[0].choices is None
+    assert message.signals[0].comment == comment
 
 
 # --- units
@@ -210,7 +212,8 @@ def test_a_start_value_may_be_any_number_that_fits_into_the_signal() -> None:
         assert theirs.decode_simple(data) == {"Foo": value}
     for number in (-2049, 2048, 0.5):
         (line,) = refused(text + start_of("Foo", number), unbound="start_value")
-        assert "Power.Foo" in line and f"GenSigStartValue {number}" in line
+        assert "Power.Foo" in line
+        assert f"GenSigStartValue {number}" in line
 
 
 # --- send types
@@ -250,7 +253,8 @@ def test_a_send_type_is_recognised_by_each_of_its_usual_names(meant: str) -> Non
 @pytest.mark.parametrize("text", ["No", "Wrong", "OnRequest", "cyclically"])
 def test_an_unknown_send_type_is_refused_unless_dbc_send_type_defines_it(text: str) -> None:
     (line,) = refused(all_sent(text))
-    assert f"GenMsgSendType {text!r} is not known" in line and f"dbc.send_type.{text!r}" in line
+    assert f"GenMsgSendType {text!r} is not known" in line
+    assert f"dbc.send_type.{text!r}" in line
     for name, meaning in ((text, "CyclicAndEvent"), ("OnChange", "Event")):
         (plan,) = compiled(all_sent(name), send_type={name: meaning}).messages
         assert plan.send_type == SEND_TYPES[meaning]
@@ -280,7 +284,8 @@ def test_alive_counters_and_checksums_are_recognised_by_their_names() -> None:
 
 
 def test_a_counter_is_sent_and_a_doubtful_counter_is_refused_unless_bound() -> None:
-    text, other = MESSAGE + signal("COUNTER"), MESSAGE + signal("ErrorCounter")
+    text = MESSAGE + signal("COUNTER")
+    other = MESSAGE + signal("ErrorCounter")
     (line,) = refused(other)
     assert "no such source" in line
     found = [
@@ -300,7 +305,8 @@ def test_a_checksum_is_refused_until_the_configuration_defines_it(
     for settings in ({}, {"unbound": "start_value"}):
         (line,) = refused(text, bind={"Nothing": 0} if counter == "Nothing" else {}, **settings)
         assert "Power.CHKSM: " in line
-        assert "dbc.e2e_data_ids.Power = 0x100" in line and "dbc.messages" in line
+        assert "dbc.e2e_data_ids.Power = 0x100" in line
+        assert "dbc.messages" in line
     bind: dict[str, str | float] = {counter: "alive"}
     for said in ({"e2e_data_ids": {"Power": 7}, "bind": bind}, {"bind": {"CHKSM": "crc"} | bind}):
         layout = compiled(text, **said)
@@ -312,7 +318,8 @@ def test_a_checksum_is_refused_until_the_configuration_defines_it(
 def test_names_that_0_5_0_took_for_e2e_profile_1_cause_a_warning() -> None:
     text = MESSAGE + signal("Crc") + signal("Alive", "8|4@1+")
     warned = "".join(compiled(text).warnings)
-    assert "AUTOSAR E2E profile 1" in warned and "= 0x100" in warned
+    assert "AUTOSAR E2E profile 1" in warned
+    assert "= 0x100" in warned
     assert "E2E" not in "".join(compiled(text, e2e_data_ids={"Power": 0x100}).warnings)
     # a counter that is bound counts in the same way as one found by its name
     other = compiled(text.replace("Alive", "MsgNo"), bind={"MsgNo": "alive"})
@@ -362,7 +369,8 @@ def test_without_telemetry_a_flag_is_0_or_its_configured_value(
 
 def test_a_bit_that_cannot_hold_both_values_of_a_flag_is_refused() -> None:
     (line,) = refused(FLAG.replace("@1+", "@1-"))
-    assert "both values of a flag" in line and "unsigned" in line
+    assert "both values of a flag" in line
+    assert "unsigned" in line
 
 
 def percent(ends: str, code: int | None = None) -> str:
@@ -400,7 +408,8 @@ def test_a_layout_without_a_signal_that_reports_the_loss_causes_a_warning(
     (message,) = layout.messages
     (flag,) = [signal for signal in message.signals if signal.name == "Undervoltage"]
     found = reporter(message, flag)
-    assert is_mute(flag) and (found.name if found else None) == name
+    assert is_mute(flag)
+    assert (found.name if found else None) == name
     warned = unreported(layout, silent=False)
     assert len(warned) == (name is None)
     assert all('on_loss = "silent"' in line and "Undervoltage" in line for line in warned)
@@ -411,7 +420,8 @@ def test_each_flag_needs_a_signal_of_its_own_esc_to_report_the_loss() -> None:
     text = MESSAGE + signal("LeftUndervoltage", "0|1@1+") + signal("RightUndervoltage", "1|1@1+")
     layout = compiled(text + signal("LeftLinkState", "8|8@1+"), ("left", "right"))
     (line,) = unreported(layout, silent=False)
-    assert "RightUndervoltage" in line and "LeftUndervoltage" not in line
+    assert "RightUndervoltage" in line
+    assert "LeftUndervoltage" not in line
 
 
 def test_a_float_of_24_bits_is_refused_even_with_a_start_value() -> None:
@@ -441,7 +451,8 @@ def test_a_capture_stores_the_dbc_settings_and_0_5_0_stored_fewer() -> None:
 def test_a_bus_with_a_baud_rate_is_read(line: str) -> None:
     text = f'VERSION ""\nNS_ :\n{line}\nBU_: GW\nBO_ 673 ESC_1: 8 GW\n' + signal("BatteryVoltage")
     (message,) = compiled(text).messages
-    assert (message.name, message.can_id) == ("ESC_1", 673)
+    assert message.name == "ESC_1"
+    assert message.can_id == 673
 
 
 def test_a_comment_that_looks_like_a_baud_rate_is_kept() -> None:
@@ -484,7 +495,8 @@ def test_messages_without_a_transmitter_need_a_selection_and_a_match() -> None:
     (line,) = refused(HEAD + UNSENT)
     assert "Select messages by dbc.messages, or name a transmitter" in line
     (line,) = refused(HEAD + UNSENT, messages=("ESC_4",))
-    assert line.startswith("dbc.messages: 'ESC_4' is no message of") and "ESC_" in line[-30:]
+    assert line.startswith("dbc.messages: 'ESC_4' is no message of")
+    assert "ESC_" in line[-30:]
 
 
 def test_a_message_with_a_transmitter_is_not_selected_by_name_alone() -> None:

@@ -126,8 +126,11 @@ def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
         'BA_REL_ "Timeout" BU_SG_REL_ Logger SG_ 257 RightConsumedCharge 250;',
     ]
     assert writer.copies_text(after) == text
-    assert text.endswith(";\n") and "\r" not in text and "\n\nBO_ 256 LeftFlow" in text
-    assert '"NS_DESC' not in text and "\nNS_ :\n" in text
+    assert text.endswith(";\n")
+    assert "\r" not in text
+    assert "\n\nBO_ 256 LeftFlow" in text
+    assert '"NS_DESC' not in text
+    assert "\nNS_ :\n" in text
 
 
 @settings(max_examples=40, deadline=None)

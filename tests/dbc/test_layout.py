@@ -96,7 +96,8 @@ def test_values_that_a_signal_cannot_hold_are_noted(signal: Sig, expected: list[
 # --- bus load ---
 
 CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)
-NO_FD, FD = 0, 14
+NO_FD = 0
+FD = 14
 
 
 def layout_of(

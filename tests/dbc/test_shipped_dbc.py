@@ -119,7 +119,8 @@ def test_a_signal_holds_every_step_of_its_field_in_the_sheet(field: sheet.Field)
         high = 1_000_000  # no motor turns faster
     low, high = sheet.STATED_RANGES.get(field.name, (low + codes, high - 2 + codes))
     least, most = exact(found.minimum, found.maximum)
-    assert least <= low * step and high * step <= most
+    assert least <= low * step
+    assert high * step <= most
 
 
 # --- other tools
@@ -156,8 +157,10 @@ def test_canmatrix_and_cantools_read_the_same_content(
     version = attributes.attributes["LayoutVersion"].value
     assert matrix.attributes == {"LayoutVersion": version, "BusType": "CAN"}
     for message, seen in zip(database.messages, matrix.frames, strict=True):
-        assert (seen.name, seen.arbitration_id.id) == (message.name, message.frame_id)
-        assert (seen.size, seen.transmitters) == (message.length, message.senders)
+        assert seen.name == message.name
+        assert seen.arbitration_id.id == message.frame_id
+        assert seen.size == message.length
+        assert seen.transmitters == message.senders
         assert seen.comment == message.comment
         kinds = (seen.arbitration_id.extended, seen.is_fd, seen.is_j1939, seen.is_multiplexed)
         assert not any(kinds)
@@ -167,8 +170,10 @@ def test_canmatrix_and_cantools_read_the_same_content(
             its = seen.signal_by_name(signal.name)
             assert not its.is_float
             assert [its.min, its.max] == exact(signal.minimum, signal.maximum)
-            assert (its.unit, its.receivers) == (signal.unit or "", signal.receivers)
-            assert (its.comment, its.values) == (signal.comment, table_of(signal))
+            assert its.unit == (signal.unit or "")
+            assert its.receivers == signal.receivers
+            assert its.comment == signal.comment
+            assert its.values == table_of(signal)
             assert its.initial_value == int(signal.raw_initial or 0) * exact(signal.scale)[0]
 
 

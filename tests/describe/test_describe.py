@@ -51,7 +51,8 @@ port = "/dev/ttyUSB1"
 def text_of(*words: object) -> str:
     """Return the output of ``describe``, which must not write to standard error."""
     done = run("describe", *words)
-    assert (done.code, done.err) == (0, ""), done.err
+    assert done.code == 0, done.err
+    assert done.err == "", done.err
     return done.out
 
 

@@ -14,7 +14,10 @@ from doctor_trees import Tree, grave, only
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.doctor.can import check_can
 
-OK, NOTE, WARNING, ERROR = "ok", "note", "warning", "error"
+OK = "ok"
+NOTE = "note"
+WARNING = "warning"
+ERROR = "error"
 PLAIN = CanConfig()
 FD = CanConfig(fd=True)
 UP = "sudo ip link set can0 up type can bitrate 500000"
@@ -143,7 +146,8 @@ def test_vcan_has_its_own_commands_even_without_ip(tree: Tree) -> None:
 def test_a_missing_can_driver_and_another_kind_of_interface_are_reported(tree: Tree) -> None:
     interface(tree, {"type": "1"})
     found = only(check_can(tree, PLAIN), "can.exists")
-    assert (found.severity, found.text) == (ERROR, "can0 is not a CAN interface")
+    assert found.severity == ERROR
+    assert found.text == "can0 is not a CAN interface"
     assert grave(check_can(tree, CanConfig(interface="pcan"))) == {"can.driver": NOTE}
 
 

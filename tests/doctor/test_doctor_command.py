@@ -34,11 +34,13 @@ def configuration(folder: Path, port: str, more: str = "") -> Path:
 def document(file: Path, code: int) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
     """Return all findings and the errors of the JSON document, after checking its form."""
     done = run("doctor", "-c", file, "--json")
-    assert (done.code, done.err) == (code, "")
+    assert done.code == code
+    assert done.err == ""
     found = json.loads(done.out)
     keys = "format version config exit_code errors warnings findings"
     assert " ".join(found) == keys
-    assert (found["format"], found["exit_code"]) == (1, code)
+    assert found["format"] == 1
+    assert found["exit_code"] == code
     findings = found["findings"]
     for finding in findings:
         assert set(finding) == {"group", "check", "severity", "text", "remedy", "command"}
@@ -53,7 +55,8 @@ def test_a_usable_setup_has_exit_code_0_and_plain_text_in_a_pipe(
     tmp_path: Path, esc: PtyEsc
 ) -> None:
     done = run("doctor", "-c", configuration(tmp_path, esc.path))
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0
+    assert done.err == ""
     for group in ("Configuration", "Serial port of esc1", "CAN doctor", "Machine"):
         assert f"{group}\n" in done.out
     assert "\x1b" not in done.out

@@ -13,7 +13,10 @@ from kontronik_can_gw.desk.doctor.service import check_folder, check_service, un
 
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 STORE = "/var/lib/kontronik-can-gw"
-OK, NOTE, WARNING, ERROR = "ok", "note", "warning", "error"
+OK = "ok"
+NOTE = "note"
+WARNING = "warning"
+ERROR = "error"
 
 
 @pytest.fixture
@@ -56,14 +59,13 @@ def test_the_state_of_the_service_is_reported(
 @pytest.mark.parametrize("folder", ["/usr/lib/systemd/system", "/etc/systemd/system"])
 def test_without_systemd_an_installation_is_not_advised(tree: Tree, folder: str) -> None:
     found = only(service(tree), "machine.service")
-    assert (found.severity, found.command) == (NOTE, f"kontronik-can-gw run --wait -c {CONFIG}")
+    assert found.severity == NOTE
+    assert found.command == f"kontronik-can-gw run --wait -c {CONFIG}"
     tree.file(f"{folder}/kontronik-can-gw.service", "")
     found = only(service(tree), "machine.service")
     assert "kontronik-can-gw.service is installed, but systemd does not run here" in found.text
-    assert (found.severity, found.command) == (
-        NOTE,
-        "sudo systemctl enable --now kontronik-can-gw.service",
-    )
+    assert found.severity == NOTE
+    assert found.command == "sudo systemctl enable --now kontronik-can-gw.service"
 
 
 # --- files and folders
@@ -93,7 +95,8 @@ def test_a_folder_must_be_writable_by_this_user_or_systemd(
     findings = Findings("Configuration")
     check_folder(tree, findings, "stored parameters", STORE, who == "of systemd", 0)
     (found,) = findings.found
-    assert (found.severity, said in f"{found.text} {found.command}") == (severity, True), found
+    assert found.severity == severity, found
+    assert said in f"{found.text} {found.command}", found
 
 
 # --- the real machine
@@ -118,5 +121,7 @@ def test_the_real_machine_is_checked_without_an_exception() -> None:
     assert machine.processes
     assert machine.space("/proc")
     assert machine.real("/proc/self/..") == "/proc"
-    assert machine.text("/proc/none") == "" and machine.names("/proc/none") == []
-    assert machine.user and machine.group_name(0) == "root"
+    assert machine.text("/proc/none") == ""
+    assert machine.names("/proc/none") == []
+    assert machine.user
+    assert machine.group_name(0) == "root"

@@ -10,7 +10,10 @@ from doctor_trees import Tree, grave, only
 
 from kontronik_can_gw.desk.doctor.ports import check_port
 
-OK, NOTE, WARNING, ERROR = "ok", "note", "warning", "error"
+OK = "ok"
+NOTE = "note"
+WARNING = "warning"
+ERROR = "error"
 BY_ID = "/dev/serial/by-id/usb-FTDI_A1234-port0"
 
 

@@ -62,7 +62,8 @@ def fields_of(row: FormRow) -> tuple[DataType, list[Field]]:
 def frame_in(wire: bytes) -> Frame:
     """Return the only frame in these bytes."""
     (found,) = Deframer().feed(wire)
-    assert (found.offset, found.form.length) == (0, len(wire))
+    assert found.offset == 0
+    assert found.form.length == len(wire)
     return found
 
 

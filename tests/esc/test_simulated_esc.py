@@ -120,7 +120,8 @@ def test_requested_error_bits_and_swapped_devices_are_sent() -> None:
     swaps = (Swap(20 * S, Device.JIVEPRO), Swap(30 * S, Device.UHV, Layout.LEGACY))
     esc = SimulatedEsc(EscOptions(faults=Faults(errors=errors, swaps=swaps)))
     frames = esc.frames_until(40 * S)
-    assert (esc.device, esc.layout) == (Device.UHV, Layout.LEGACY)
+    assert esc.device == Device.UHV
+    assert esc.layout == Layout.LEGACY
     for sent, frame in zip(frames, received(frames), strict=True):
         at = sent.time_ns / S
         data = sent.data

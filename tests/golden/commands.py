@@ -59,7 +59,8 @@ def play(text: str) -> str:
 
 
 def _play_case(lines: list[str], folder: Path) -> Iterator[str]:
-    name, source = "", ""
+    name = ""
+    source = ""
     body: list[str] = []
     for line in [*lines, "$"]:
         if line.startswith(("--- ", "$")):
@@ -68,7 +69,9 @@ def _play_case(lines: list[str], folder: Path) -> Iterator[str]:
                     body.pop()
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (folder / name).write_bytes(_content(source, body))
-            name, source, body = "", "", []
+            name = ""
+            source = ""
+            body = []
             if line.startswith("--- "):
                 name, _, source = line[4:].partition(" < ")
                 yield line
@@ -125,7 +128,8 @@ def _edited(text: str, edits: list[str]) -> str:
     lines = text.split(newline)
     at = 0
     for edit in edits:
-        mark, content = edit[0], edit[2:]
+        mark = edit[0]
+        content = edit[2:]
         if mark == "+":
             lines.insert(at, content)
             at += 1

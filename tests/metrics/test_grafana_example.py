@@ -68,7 +68,8 @@ def prometheus(tmp_path: Path) -> Iterator[Prometheus]:
     bench = Bench(2)
     bench.run(3)
     document = bench.document()
-    file, stop = tmp_path / "status.json", threading.Event()
+    file = tmp_path / "status.json"
+    stop = threading.Event()
 
     def refresh() -> None:
         while not stop.wait(0.1):

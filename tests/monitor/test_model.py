@@ -79,10 +79,13 @@ def test_extremes_and_availability_are_right_for_any_values(values: list[int | N
             assert track.low == pytest.approx(min(sent))
             assert track.high == pytest.approx(max(sent))
         else:
-            assert (track.low, track.high) == (None, None)
+            assert track.low is None
+            assert track.high is None
     monitor.reset()
     track = esc.tracks["battery_current"]
-    assert (track.low, track.high, list(track.history)) == (None, None, [])
+    assert track.low is None
+    assert track.high is None
+    assert list(track.history) == []
 
 
 @given(st.lists(FRAME, max_size=40), st.data())

@@ -85,7 +85,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_once_shows_the_values_at_the_end_of_a_log(log: Path) -> None:
     found = document(run("monitor", log, "--once"))
     frames = flight(ONE, 12)
-    assert (found["file"], found["frames"]) == ("flight.log", len(frames))
+    assert found["file"] == "flight.log"
+    assert found["frames"] == len(frames)
     last: dict[str, Any] = {}
     for _, frame in frames:
         last.update(ONE.database.decode_message(frame.can_id, frame.data))  # type: ignore[arg-type]
@@ -106,7 +107,8 @@ def test_a_capture_is_shown_with_its_own_dbc(tmp_path: Path, clock: Clock) -> No
     assert all(20 < esc["values"]["battery_voltage"] < 26 for esc in found["escs"])
     assert "\ne1 " in run("monitor", file, "--speed", 4).out
     done = run("monitor", file, "--dbc", DBC)
-    assert (done.code, done.out) == (2, "")
+    assert done.code == 2
+    assert done.out == ""
     assert "x.kcap: is a capture, which holds its own DBC. Leave -c and --dbc out." in done.err
 
 
@@ -124,7 +126,8 @@ def test_a_recording_is_played_in_real_time(log: Path, clock: Clock, speed: floa
     late: list[float] = []
     with open_input(log) as opened:
         recording = Recording(opened, speed)
-        first, begun = recording.now(), clock.now
+        first = recording.now()
+        begun = clock.now
 
         def take(_: object, now: int) -> None:
             late.append(clock.now - begun - (now - first) / SECOND_NS / speed)
@@ -167,7 +170,8 @@ def test_stream_writes_a_line_each_second_of_a_recording(log: Path, clock: Clock
         expected = json.loads(json.dumps(monitor.document()))
         assert one["escs"][0]["values"] == expected["escs"][0]["values"]
         assert one["frames"] == len(frames) - len(waiting)
-    assert len(found) == 12 and found[-1]["frames"] == len(frames)
+    assert len(found) == 12
+    assert found[-1]["frames"] == len(frames)
     assert {one["problem"] for one in found} == {None}
 
 
@@ -261,7 +265,8 @@ def test_a_name_may_be_an_interface_or_a_recording(
         assert opened == []
         assert done.code == (2 if name == "missing.log" else 0)
     else:
-        assert (opened, done.code) == ([channel], 1)
+        assert opened == [channel]
+        assert done.code == 1
 
 
 def test_an_interface_is_named_once() -> None:

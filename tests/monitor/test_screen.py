@@ -198,7 +198,8 @@ def test_long_names_do_not_hide_the_charge(kind: str, monkeypatch: pytest.Monkey
     for esc, row in zip(monitor.escs, rows, strict=True):
         assert row.endswith(f" {number(esc.number('consumed_charge'))}")
         shortened = row.partition(" ")[0]
-        assert "…" in shortened and shortened[-1] == esc.name[-1], "the end is what differs"
+        assert "…" in shortened, "the end is what differs"
+        assert shortened[-1] == esc.name[-1], "the end is what differs"
     wide = "\n".join(texts(monitor, (120, 24)))
     assert all(name in wide for name in names)
 

@@ -231,7 +231,8 @@ def openssl(*words: object) -> None:
 
 
 def test_tls_accepts_an_own_authority_and_refuses_wrong_certificates(tmp_path: Path) -> None:
-    authority, secret = tmp_path / "authority.pem", tmp_path / "authority.key"
+    authority = tmp_path / "authority.pem"
+    secret = tmp_path / "authority.key"
     new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
     openssl("req", "-x509", *new, "-subj", "/CN=authority", "-keyout", secret, "-out", authority)
     for name in ("localhost", "boat"):
@@ -288,7 +289,8 @@ def live(tmp_path: Path) -> Iterator[Live]:
 def test_state_is_retained_and_reported_to_the_service_manager(
     live: Live, broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said, state = "", "kontronik/sd/online"
+    said = ""
+    state = "kontronik/sd/online"
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     monkeypatch.setenv("WATCHDOG_USEC", "1000000")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
@@ -343,7 +345,8 @@ def test_broker_that_starts_late_stops_and_starts_again(live: Live, tmp_path: Pa
 
 
 def test_wrong_password_is_logged_once_and_a_new_one_is_used(live: Live, tmp_path: Path) -> None:
-    users, secret = tmp_path / "users", written(tmp_path / "password", "wrong donkey\nmore\n")
+    users = tmp_path / "users"
+    secret = written(tmp_path / "password", "wrong donkey\nmore\n")
     command = ["mosquitto_passwd", "-b", "-c", str(users), "boat", "right horse"]
     subprocess.run(command, check=True, capture_output=True)
     broker = Mosquitto(tmp_path, f"allow_anonymous false\npassword_file {users}\n")

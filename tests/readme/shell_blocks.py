@@ -102,5 +102,6 @@ def run_block(block: Block, folder: Path, before: str = "", *around: str) -> str
             with contextlib.suppress(ProcessLookupError):  # all its processes have ended
                 os.killpg(process.pid, signal.SIGKILL)
     said = (folder / "printed").read_text()
-    assert (code, "Traceback" in said) == (0, False), f"{block.place}:\n{block.text}\n{said}"
+    assert code == 0, f"{block.place}:\n{block.text}\n{said}"
+    assert "Traceback" not in said, f"{block.place}:\n{block.text}\n{said}"
     return said

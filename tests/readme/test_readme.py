@@ -130,7 +130,8 @@ def test_pictures_can_be_made_again(tmp_path: Path) -> None:
         pytest.skip(MISSING)
     main(tmp_path)
     made = {path.name for path in tmp_path.iterdir()}
-    assert made > set(SHOWN) and len(made) == 4 + len(VIEWS)
+    assert made > set(SHOWN)
+    assert len(made) == 4 + len(VIEWS)
 
 
 # --- examples
@@ -139,7 +140,8 @@ def test_pictures_can_be_made_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.parent.name)
 def test_check_accepts_each_example_without_a_warning(file: Path) -> None:
     done = run("check", file)
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0
+    assert done.err == ""
 
 
 @pytest.mark.parametrize(

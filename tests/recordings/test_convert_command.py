@@ -60,7 +60,8 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     said = refused(1, "convert", dump, tmp_path / "out", "--to", form)
-    assert needed + "Install it: " in said and module in said.partition("Install it: ")[2]
+    assert needed + "Install it: " in said
+    assert module in said.partition("Install it: ")[2]
     assert [path.name for path in tmp_path.iterdir()] == ["esc.bytes"]
 
 

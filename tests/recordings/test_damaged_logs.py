@@ -156,7 +156,8 @@ def test_a_container_of_an_impossible_size_is_reported_as_damage(tmp_path: Path,
     content[152:156] = struct.pack("<L", size)
     path.write_bytes(content)
     found, damage = read_log(path)
-    assert found == items[: len(found)] and 1000 < len(found) < len(items)
+    assert found == items[: len(found)]
+    assert 1000 < len(found) < len(items)
     assert damage[0] == f"a container of {size} bytes at byte 144"
 
 
@@ -193,4 +194,5 @@ def test_trc_of_version_1_0_is_read_if_its_header_names_the_version(
     lines = "  1)    1.0  0123  2  00 11\n  2)    2.0  0123  1  RTR\n  3)    3.0  00000124  1  22"
     path.write_text(TRC.format(version, lines))
     found, said = read_log(path)
-    assert (len(found), said) == (count, damage)
+    assert len(found) == count
+    assert said == damage

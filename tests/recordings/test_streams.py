@@ -209,7 +209,8 @@ def _bytes_in(pipe: IO[bytes]) -> int:
 
 
 def test_a_full_disk_keeps_the_rows_of_a_stream(tmp_path: Path) -> None:
-    lines, target = candump_lines(tmp_path), tmp_path / "out.csv"
+    lines = candump_lines(tmp_path)
+    target = tmp_path / "out.csv"
     expected = rows_of(tmp_path / "whole.log")
 
     def small() -> None:
@@ -300,7 +301,8 @@ def test_the_monitor_shows_a_stream_before_it_ends(tmp_path: Path) -> None:
     with started("monitor", "-") as process:
         send(process, b"".join(candump_lines(tmp_path)))
         assert process.stdout is not None
-        shown, has_values = b"", False
+        shown = b""
+        has_values = False
         while not (has_values and shown.endswith(b"errors: -\n")):
             assert select.select([process.stdout], [], [], _HUNG_S)[0], shown
             shown += os.read(process.stdout.fileno(), 1 << 16)
@@ -375,7 +377,8 @@ def test_the_inspected_head_is_read_again() -> None:
         assert stream.look()
         assert stream.head == b"head and more"
         reader = StreamReader(stream)
-        assert (reader.read1(6), reader.read1(100)) == (b"head a", b"nd more")
+        assert reader.read1(6) == b"head a"
+        assert reader.read1(100) == b"nd more"
 
 
 def test_frames_in_order_are_given_without_the_next_one(tmp_path: Path) -> None:

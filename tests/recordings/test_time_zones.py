@@ -24,7 +24,8 @@ def test_local_time_is_not_utc() -> None:
     ("suffix", "read"), [(".csv", read_csv), (".jsonl", read_jsonl), (".parquet", read_parquet)]
 )
 def test_a_table_has_utc(tmp_path: Path, suffix: str, read: Callable[[Path], Cells]) -> None:
-    source, target = tmp_path / "flight.kcap", tmp_path / f"flight{suffix}"
+    source = tmp_path / "flight.kcap"
+    target = tmp_path / f"flight{suffix}"
     source.write_bytes(capture_bytes(1, seconds=1.0))
     assert convert(source, target) == 0
     rows = read(target)

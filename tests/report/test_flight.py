@@ -132,7 +132,8 @@ def test_the_numbers_equal_those_computed_by_pandas(
         data = with_computed(table(bus, rows, esc, source, *MEASURED), source).dropna()
         values = data[source].to_numpy(float)
         at = values.argmin() if source in MINIMA else values.argmax()
-        assert (extreme.value, extreme.time_ns) == (values[at], data.time_ns.iloc[at]), source
+        assert extreme.value == values[at], source
+        assert extreme.time_ns == data.time_ns.iloc[at], source
 
 
 def test_errors_and_a_swapped_device_are_events_at_their_times(flight: Flight) -> None:
@@ -268,7 +269,8 @@ def test_words_of_errors_and_states_become_events() -> None:
     for source, kind in kinds.items():
         fields.append(Field(source, "", kind, source=source, esc=0, signal=source))
     esc = EscFlight(0, layout_of(["esc1"]).escs[0], fields, events)
-    programming, unknown = 1 << OperatingError.PROGRAMMING_ALLOWED, 1 << 30
+    programming = 1 << OperatingError.PROGRAMMING_ALLOWED
+    unknown = 1 << 30
     words = [programming, programming | unknown, 1, 1, None]
     states = ["Forward", "Forward", 99, "odd", None]
     rows: list[list[Any]] = [

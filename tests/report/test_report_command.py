@@ -39,7 +39,8 @@ def test_the_page_of_a_part_can_be_written_to_standard_output(dump: Path) -> Non
     part = dump.with_name("part <1>")
     part.write_bytes(dump.read_bytes())
     done = run("report", part, "-o", "-", "--from", 5, "--until", 15)
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0
+    assert done.err == ""
     assert "<h1>part &lt;1&gt;</h1>" in done.out
     assert "0:05.0 to 0:15.0 of the recording" in done.out
     assert not [event for event in data_of(done.out)["events"] if event["kind"] == "error"]

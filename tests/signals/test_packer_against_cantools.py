@@ -107,7 +107,8 @@ def test_random_layout_is_packed_as_oracle_and_cantools_expect(seed: int) -> Non
         for message in messages:
             for place, page in enumerate(message.pages):
                 frame = makers[message.name](escs, gateway, now, 0, place)
-                key, is_fd = (message.can_id, message.extended), message.length > 8
+                key = (message.can_id, message.extended)
+                is_fd = message.length > 8
                 assert frame == CanFrame(key[0], frame.data, key[1], is_fd, place)
                 assert len(frame.data) == message.length
                 check_frame(message, page, frame.data, database, (escs, gateway, now))
