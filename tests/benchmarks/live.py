@@ -69,7 +69,11 @@ def cpu(context: Context) -> list[Figure]:
     Frames that are lost need no CPU time, so the losses are noted.
     """
     figures = []
-    targets = {1: ("<= 1.35", ">= 6"), 8: ("<= 1.25", ">= 6"), 64: ("<= 1.2", "")}
+    targets = {
+        1: ("<= 1.35", ">= 6"),
+        8: ("<= 1.25", ">= 6"),
+        64: ("<= 1.2", ""),
+    }
     if context.quick:
         targets = {1: targets[1]}
     for escs, (most, least) in targets.items():
@@ -112,7 +116,10 @@ def many(context: Context) -> list[Figure]:
     figures = []
     last_core = max(os.sched_getaffinity(0))
     pinned = ("taskset", "-c", str(last_core))
-    cases: list[tuple[int, tuple[str, ...]]] = [(128, ()), (30, pinned)]
+    cases: list[tuple[int, tuple[str, ...]]] = [
+        (128, ()),
+        (30, pinned),
+    ]
     if context.quick:
         cases = [(4, ()), (2, pinned)]
     for escs, prefix in cases:

@@ -40,7 +40,11 @@ class Run(NamedTuple):
 
 
 def convert(
-    context: Context, form: str, source: Path, live: bool = False, dbc: Path | None = None
+    context: Context,
+    form: str,
+    source: Path,
+    live: bool = False,
+    dbc: Path | None = None,
 ) -> Run:
     """Convert a recording. With ``live``, only the 16 values of live data are converted."""
     from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table

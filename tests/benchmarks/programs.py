@@ -82,7 +82,16 @@ class Context:
             raise LeftOut(f"no gcc to compile {name} with:  sudo apt-get install gcc libc6-dev")
         program = self.folder / source.stem
         if not program.exists() or program.stat().st_mtime < source.stat().st_mtime:
-            command = [gcc, "-O2", "-Wall", "-Wextra", "-o", str(program), str(source), *options]
+            command = [
+                gcc,
+                "-O2",
+                "-Wall",
+                "-Wextra",
+                "-o",
+                str(program),
+                str(source),
+                *options,
+            ]
             subprocess.run(command, check=True)
         return program
 
@@ -127,7 +136,12 @@ def new_bus() -> str:
     return f"kontronik-{uuid.uuid4().hex[:12]}"
 
 
-def write_config(folder: Path, ports: Sequence[str], dbc: Path, further: str = "") -> Path:
+def write_config(
+    folder: Path,
+    ports: Sequence[str],
+    dbc: Path,
+    further: str = "",
+) -> Path:
     """Write the gateway's configuration.
 
     The bus load is compared with its 1 Mbit/s. ``further`` has more lines, with tables at the end.

@@ -73,7 +73,12 @@ def set_up(master: Master, node: int, kind: int) -> None:
             master.ask(node, head + value.to_bytes(4, "little"))
 
 
-def measure(master: Master, escs: list[PtyEsc], seconds: float, sync_hz: float) -> list[float]:
+def measure(
+    master: Master,
+    escs: list[PtyEsc],
+    seconds: float,
+    sync_hz: float,
+) -> list[float]:
     """Return the sorted latencies in seconds."""
     lives = [encode(LiveData(n, 2442 + n % 7, n % 50), Layout.V4) for n in range(100)]
     start = time.monotonic()

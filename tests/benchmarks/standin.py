@@ -21,7 +21,12 @@ class BusSocket(socket.socket):
 
     name = ""
 
-    def __init__(self, family: int = -1, kind: int = -1, *further: Any) -> None:
+    def __init__(
+        self,
+        family: int = -1,
+        kind: int = -1,
+        *further: Any,
+    ) -> None:
         self.is_bus = family == socket.AF_CAN
         if self.is_bus:
             super().__init__(socket.AF_UNIX, socket.SOCK_SEQPACKET)

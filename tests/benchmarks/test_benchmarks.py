@@ -9,7 +9,9 @@ from programs import Context, Figure, LeftOut
 
 @pytest.mark.extended
 def test_a_short_run_of_the_three_programs_gives_a_table(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     monkeypatch.setattr(bench, "FOLDER", tmp_path)
     assert bench.main(["--quick", "--only", "cpu"]) == 0

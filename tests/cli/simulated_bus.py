@@ -75,7 +75,12 @@ def with_errors(*bits: OperatingError | SelfTestError) -> EscOptions:
     return EscOptions(profile=FLYING, faults=Faults(errors=errors))
 
 
-def write_log(path: Path, frames: Timed, channel: str = "can0", start_s: float = START_S) -> Path:
+def write_log(
+    path: Path,
+    frames: Timed,
+    channel: str = "can0",
+    start_s: float = START_S,
+) -> Path:
     """Write a candump log."""
     lines = []
     for now, frame in frames:

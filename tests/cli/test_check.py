@@ -106,9 +106,18 @@ def test_the_fingerprint_identifies_the_layout_in_file_and_frames(
 
 
 @pytest.mark.rights
-@pytest.mark.parametrize(("code", "words"), [(2, "check"), (2, "decode gateway.toml")])
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (2, "check"),
+        (2, "decode gateway.toml"),
+    ],
+)
 def test_an_unreadable_file_is_reported_in_one_line(
-    places: tuple[Path, Path], code: int, words: str, monkeypatch: pytest.MonkeyPatch
+    places: tuple[Path, Path],
+    code: int,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Root may read every file, so the test gives up its rights while the command runs."""
     own, _ = places
@@ -157,7 +166,9 @@ def test_toml_beyond_the_limits_of_python_is_explained_to_users(text: str, tmp_p
     ],
 )
 def test_a_bad_password_file_is_explained_to_users(
-    content: bytes | None, said: str, tmp_path: Path
+    content: bytes | None,
+    said: str,
+    tmp_path: Path,
 ) -> None:
     if content is not None:
         written(tmp_path / "password", content)
@@ -171,7 +182,9 @@ def test_a_bad_password_file_is_explained_to_users(
     [(None, "cannot be read: No such file or directory"), (b"x", "cannot be used for TLS")],
 )
 def test_a_bad_certificate_is_explained_to_users(
-    content: bytes | None, said: str, tmp_path: Path
+    content: bytes | None,
+    said: str,
+    tmp_path: Path,
 ) -> None:
     if content is not None:
         written(tmp_path / "ca.pem", content)

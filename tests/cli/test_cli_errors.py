@@ -92,7 +92,10 @@ def forbidden(path: str, mode: int) -> list[str]:
     [(0o660, "Join its group: sudo usermod -aG {} $USER"), (0o600, "chmod g+rw")],
 )
 def test_a_port_without_permission_is_reported_with_the_group_to_join(
-    tmp_path: Path, terminal: PtyEsc, mode: int, remedy: str
+    tmp_path: Path,
+    terminal: PtyEsc,
+    mode: int,
+    remedy: str,
 ) -> None:
     with contextlib.suppress(LookupError, PermissionError):
         shutil.chown(terminal.path, group="tty")
@@ -101,7 +104,10 @@ def test_a_port_without_permission_is_reported_with_the_group_to_join(
     command = [*before, *PROGRAM, "run", "-c", str(configuration(tmp_path, terminal.path))]
     path = os.pathsep.join(filter(None, sys.path))
     done = subprocess.run(
-        command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path}
+        command,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path},
     )
     assert done.returncode == 1
     assert done.stdout == ""
@@ -135,7 +141,9 @@ LONG = "x" * 300
     ],
 )
 def test_a_name_that_is_too_long_is_reported_in_one_line(
-    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     done = run(*words.split())
@@ -228,7 +236,9 @@ def test_the_lines_that_replace_removed_options_are_accepted() -> None:
 
 @pytest.mark.parametrize("words", ["mqtt --broker x", "replay x.bin --on can"])
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
-    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Opening some adapters writes to them, and nothing may be written to an ESC."""
     monkeypatch.chdir(tmp_path)

@@ -60,7 +60,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def closed(
-    words: str, folder: Path, *, has_closed_stderr: bool
+    words: str,
+    folder: Path,
+    *,
+    has_closed_stderr: bool,
 ) -> "subprocess.CompletedProcess[bytes]":
     """Run a command with a closed pipe as its standard output, which is buffered as usual."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}

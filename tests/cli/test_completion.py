@@ -44,11 +44,18 @@ ASKED = r"""
     ],
 )
 def test_bash_completes_commands_options_choices_and_files_of_the_right_kind(
-    script: Path, typed: str, offered: set[str]
+    script: Path,
+    typed: str,
+    offered: set[str],
 ) -> None:
     command = ["bash", "--norc", "-c", ASKED, str(script), typed]
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=60, check=True, cwd=script.parent
+        command,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        cwd=script.parent,
     )
     assert set(done.stdout.split()) == offered
 

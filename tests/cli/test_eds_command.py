@@ -75,7 +75,9 @@ def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
     ("output", "named"), [("left.dcf", "left.dcf"), ("mötor.dcf", "mine_1.dcf")]
 )
 def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
-    tmp_path: Path, output: str, named: str
+    tmp_path: Path,
+    output: str,
+    named: str,
 ) -> None:
     shipped_name = b"FileName=kontronik_esc.eds\r\n"
     other_names = b"filename = old.eds\r\nLastEDS=older.eds\r\n"

@@ -116,7 +116,10 @@ def test_an_input_that_does_not_exist_has_exit_code_2(command: str, kind: str, _
 
 @pytest.mark.parametrize(("command", "kind", "wrong"), INPUTS)
 def test_an_input_of_another_kind_has_exit_code_2(
-    command: str, kind: str, wrong: str, folder: Path
+    command: str,
+    kind: str,
+    wrong: str,
+    folder: Path,
 ) -> None:
     written(folder / f"wrong.{kind}", wrong)
     refused(2, command.format(f=f"wrong.{kind}"), "wrong")
@@ -124,7 +127,10 @@ def test_an_input_of_another_kind_has_exit_code_2(
 
 @pytest.mark.parametrize(("command", "kind", "_wrong"), INPUTS)
 def test_an_input_that_is_a_folder_has_exit_code_2(
-    command: str, kind: str, _wrong: str, folder: Path
+    command: str,
+    kind: str,
+    _wrong: str,
+    folder: Path,
 ) -> None:
     (folder / f"folder.{kind}").mkdir()
     refused(2, command.format(f=f"folder.{kind}"), "folder")
@@ -132,7 +138,11 @@ def test_an_input_that_is_a_folder_has_exit_code_2(
 
 @pytest.mark.parametrize(("command", "kind", "_wrong"), INPUTS)
 def test_an_input_without_read_permission_has_exit_code_2(
-    command: str, kind: str, _wrong: str, folder: Path, request: pytest.FixtureRequest
+    command: str,
+    kind: str,
+    _wrong: str,
+    folder: Path,
+    request: pytest.FixtureRequest,
 ) -> None:
     written(folder / f"closed.{kind}", CONFIGURATION)
     if command.startswith("doctor"):

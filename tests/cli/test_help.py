@@ -82,7 +82,9 @@ def test_dronecan_is_named_in_every_description_of_the_program() -> None:
     ],
 )
 def test_a_mistyped_command_line_shows_usage_and_suggestion(
-    words: str, usage: str, said: str
+    words: str,
+    usage: str,
+    said: str,
 ) -> None:
     done = run(*words.split())
     assert done.code == 2

@@ -35,7 +35,9 @@ def test_each_extra_has_the_library_of_pyproject() -> None:
     ],
 )
 def test_in_a_virtual_environment_the_advice_installs_the_library_alone(
-    prefix: str, command: str, monkeypatch: pytest.MonkeyPatch
+    prefix: str,
+    command: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sys, "prefix", prefix)
     monkeypatch.setattr(sys, "executable", "/x/bin/python")
@@ -46,7 +48,9 @@ def test_in_a_virtual_environment_the_advice_installs_the_library_alone(
 
 @pytest.mark.parametrize("is_debian", [True, False])
 def test_in_the_debian_package_the_advice_is_to_install_a_clone(
-    is_debian: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    is_debian: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sys, "prefix", "/usr")
     monkeypatch.setattr(sys, "base_prefix", "/usr")

@@ -64,7 +64,11 @@ def test_a_file_that_exists_is_replaced_only_with_force(command: str, folder: Pa
 @pytest.mark.parametrize("command", COMMANDS)
 def test_an_output_that_cannot_be_written_leaves_no_file(command: str, folder: Path) -> None:
     before = names(folder)
-    for output, code in (("none/out", 1), ("x.bin/out", 1), (".", 2)):
+    for output, code in (
+        ("none/out", 1),
+        ("x.bin/out", 1),
+        (".", 2),
+    ):
         done = run(*command.format(o=output).split(), "--force")
         assert done.code == code, done
         assert done.out == "", done
@@ -140,7 +144,14 @@ def test_two_outputs_are_refused_and_so_is_a_missing_output() -> None:
     assert run("init", "a", "-o", "b").code == run("export", "c").code == 2
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGTERM,
+        signal.SIGINT,
+        signal.SIGHUP,
+    ],
+)
 def test_a_signal_leaves_no_partly_written_file(number: int, folder: Path) -> None:
     before = names(folder)
     command = [*PROGRAM, "simulate", "--seconds", "1000h", "-o", "long.bin"]

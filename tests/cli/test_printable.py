@@ -71,7 +71,9 @@ def folder(tmp_path: Path) -> Path:
     """Write a configuration whose DBC and EDS have such characters in all texts."""
     evil = "a\x1bEVIL\x07\x9b\u202eb"
     dbc = re.sub(
-        r'(CM_ (?:SG_|BO_)?[^"]*"|NotAvailable" 0x|VAL_ 1664 OperatingState 1 ")', rf"\1{evil}", DBC
+        r'(CM_ (?:SG_|BO_)?[^"]*"|NotAvailable" 0x|VAL_ 1664 OperatingState 1 ")',
+        rf"\1{evil}",
+        DBC,
     )
     (tmp_path / "my.dbc").write_text(dbc)
     eds = re.sub(r"ParameterName=([^\n]*)", "ParameterName=\\1 a\x1bEVIL\x07\x7fb", EDS)
@@ -83,7 +85,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("words", [["describe"], ["describe", "--format", "json"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["describe"],
+        ["describe", "--format", "json"],
+    ],
+)
 def test_descriptions_of_hostile_files_are_cleaned(words: list[str], folder: Path) -> None:
     done = run(*words, "-c", folder / "gateway.toml")
     assert done.code == 0, done.err
@@ -114,7 +122,10 @@ def test_a_file_shown_on_a_terminal_is_cleaned(
     ],
 )
 def test_error_messages_about_hostile_files_are_cleaned(
-    name: str, content: str, words: str, tmp_path: Path
+    name: str,
+    content: str,
+    words: str,
+    tmp_path: Path,
 ) -> None:
     path = tmp_path / name
     path.write_text(content)

@@ -57,7 +57,10 @@ def folder(tmp_path: Path) -> Path:
     ],
 )
 def test_ctrl_c_while_modules_are_loaded_ends_silently(
-    module: str, words: list[str], start: str, folder: Path
+    module: str,
+    words: list[str],
+    start: str,
+    folder: Path,
 ) -> None:
     code = INTERRUPTED.format(module=module, words=words, start=start, loaded=["argparse"])
     done = run(sys.executable, "-c", code, folder=folder)

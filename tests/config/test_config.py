@@ -87,7 +87,10 @@ def test_value_in_use_differs_from_the_value_written() -> None:
     ],
 )
 def test_broker_has_the_usual_port_unless_it_is_given(
-    text: str, host: str, plain: int, encrypted: int
+    text: str,
+    host: str,
+    plain: int,
+    encrypted: int,
 ) -> None:
     for tls, port in ((False, plain), (True, encrypted)):
         mqtt = {"broker": text, "tls": tls}
@@ -166,7 +169,9 @@ OTHERS: list[tuple[dict[str, Any], list[str]]] = [
 
 @pytest.mark.parametrize(("made", "expected"), OTHERS)
 def test_mistakes_of_every_file_are_reported_together(
-    tmp_path: Path, made: dict[str, Any], expected: list[str]
+    tmp_path: Path,
+    made: dict[str, Any],
+    expected: list[str],
 ) -> None:
     (tmp_path / "my.dbc").write_text(DBC)
     tables = {"dbc": {"file": "my.dbc"}} | made
@@ -301,7 +306,18 @@ def given(table: str, key: str) -> list[tuple[bool | None, Any]]:
     texts = ["", " ", "x", "a b", "1a", "A234567890123", "max"]
     ratios = ["1/3", "98/10", "9.8/2", " 1/3", "1 / 3", "1e1", ".5", "+1", "-1", "٣"]
     others: list[Any] = [True, False, [], [1], {}]
-    entries: list[Any] = [1, "x", "", True, 1.5, -1, 65_535, 65_536, {}, []]
+    entries: list[Any] = [
+        1,
+        "x",
+        "",
+        True,
+        1.5,
+        -1,
+        65_535,
+        65_536,
+        {},
+        [],
+    ]
     entries += [{"b": 1}, {"b": "x"}, {"b": {"c": 1}}, {"b": []}]
     values: list[Any] = [*numbers, *fractions, *texts, *ratios, *others]
     values += [{"a": entry} for entry in entries]
@@ -337,7 +353,16 @@ def test_schema_and_parser_accept_the_same_and_toml_is_equal() -> None:
 
 def test_schema_and_parser_accept_the_same_kinds_of_tables() -> None:
     two_escs = [{"port": "a"}, {"port": "b"}]
-    kinds: list[Any] = [{}, [], 1, "x", [{}], [1], two_escs, [{}, {}]]
+    kinds: list[Any] = [
+        {},
+        [],
+        1,
+        "x",
+        [{}],
+        [1],
+        two_escs,
+        [{}, {}],
+    ]
     for table in (*KEYS, "x"):
         for kind in kinds:
             made = tables() | {table: kind}

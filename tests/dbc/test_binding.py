@@ -83,7 +83,10 @@ def test_a_binding_overrides_the_name_of_the_signal() -> None:
 
 def test_a_binding_with_the_message_overrides_one_of_the_signal_alone() -> None:
     voltage = Sig("U", 0, 16)
-    messages = [Msg("A", 1, 8, [voltage]), Msg("B", 2, 8, [voltage])]
+    messages = [
+        Msg("A", 1, 8, [voltage]),
+        Msg("B", 2, 8, [voltage]),
+    ]
     bind = {"U": "battery_voltage", "B.U": "operating_state_raw"}
     plans = layout_of(messages, bind=bind).messages
     sources = [plan.signals[0].source for plan in plans]
@@ -174,9 +177,15 @@ def theirs(data: bytes, at: int, data_id: int) -> bytes:
     return bytes(buffer)
 
 
-@given(st.binary(min_size=2, max_size=64), st.integers(0, 0xFFFF), st.data())
+@given(
+    st.binary(min_size=2, max_size=64),
+    st.integers(0, 0xFFFF),
+    st.data(),
+)
 def test_the_crc_equals_the_one_of_the_autosar_package_at_every_place(
-    data: bytes, data_id: int, draw: st.DataObject
+    data: bytes,
+    data_id: int,
+    draw: st.DataObject,
 ) -> None:
     at = draw.draw(st.integers(0, len(data) - 2))
     assert e2e_crc(data, at, data_id) == theirs(data, at, data_id)[at]
@@ -187,7 +196,9 @@ def test_the_crc_equals_the_one_of_the_autosar_package_at_every_place(
     [(0, 4, {}), (3, 5, {}), (7, 8, {"M": 0xABCD}), (1, 4, {"M": 0})],
 )
 def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
-    at: int, length: int, data_ids: dict[str, int]
+    at: int,
+    length: int,
+    data_ids: dict[str, int],
 ) -> None:
     counter_at = 8 * ((at + 1) % 8)
     value_at = 16 * ((at // 2 + 2) % 4)

@@ -60,7 +60,9 @@ def nested(depth: int, width: int) -> str:
     ],
 )
 def test_a_file_out_of_bounds_is_refused_in_one_line_without_cantools(
-    text: str, said: str, monkeypatch: pytest.MonkeyPatch
+    text: str,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def must_not_be_called(*_: object, **__: object) -> None:
         pytest.fail("cantools was called")

@@ -151,7 +151,12 @@ def check_frames(database: Database, layout: Layout, bound: Mapping[str, str]) -
                 check_signal(signal, planned[signal.name], source, read[signal.name])
 
 
-def check_signal(signal: Signal, planned: SignalPlan, source: str | None, raw: Any) -> None:
+def check_signal(
+    signal: Signal,
+    planned: SignalPlan,
+    source: str | None,
+    raw: Any,
+) -> None:
     if source is None:
         if planned.unbound and planned.not_available != planned.constant:
             assert raw == (signal.raw_initial or 0)

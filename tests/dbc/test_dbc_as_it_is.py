@@ -29,7 +29,11 @@ from kontronik_can_gw.times import MS
 
 
 def signal(
-    name: str, place: str = "0|8@1+", unit: str = "", scale: str = "1,0", ends: str = "0|0"
+    name: str,
+    place: str = "0|8@1+",
+    unit: str = "",
+    scale: str = "1,0",
+    ends: str = "0|0",
 ) -> str:
     return f' SG_ {name} : {place} ({scale}) [{ends}] "{unit}" Other\n'
 
@@ -107,7 +111,10 @@ SPELLED = [IRRATIONAL, *((unit, *row) for unit, rows in UNITS.items() for row in
 
 @pytest.mark.parametrize(("unit", "texts", "factor", "shift"), SPELLED)
 def test_a_unit_is_recognised_in_each_of_its_spellings(
-    unit: str, texts: str, factor: str, shift: str
+    unit: str,
+    texts: str,
+    factor: str,
+    shift: str,
 ) -> None:
     meant = pytest.approx([float(Fraction(factor)), float(Fraction(shift))], rel=1e-11)
     for text in texts.split("|"):
@@ -308,7 +315,10 @@ def test_a_checksum_is_refused_until_the_configuration_defines_it(
         assert "dbc.e2e_data_ids.Power = 0x100" in line
         assert "dbc.messages" in line
     bind: dict[str, str | float] = {counter: "alive"}
-    for said in ({"e2e_data_ids": {"Power": 7}, "bind": bind}, {"bind": {"CHKSM": "crc"} | bind}):
+    for said in (
+        {"e2e_data_ids": {"Power": 7}, "bind": bind},
+        {"bind": {"CHKSM": "crc"} | bind},
+    ):
         layout = compiled(text, **said)
         assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
         assert not layout.warnings[:-1]
@@ -355,7 +365,9 @@ SNA = 'VAL_ 256 Undervoltage 1 "NotAvailable" ;\n'
     ],
 )
 def test_without_telemetry_a_flag_is_0_or_its_configured_value(
-    text: str, on_loss: int | None, raw: int
+    text: str,
+    on_loss: int | None,
+    raw: int,
 ) -> None:
     layout = compiled(text, flags_on_loss=on_loss)
     (plan,) = layout.messages
@@ -432,7 +444,11 @@ def test_a_float_of_24_bits_is_refused_even_with_a_start_value() -> None:
 
 def test_a_capture_stores_the_dbc_settings_and_0_5_0_stored_fewer() -> None:
     old = DbcConfig(bind={"A.B": 1}, base_id=5, e2e_data_ids={"M": 7}, on_loss="silent")
-    later: dict[str, Any] = {"units": {"x": "V"}, "messages": ("Motor_*",), "flags_on_loss": 1}
+    later: dict[str, Any] = {
+        "units": {"x": "V"},
+        "messages": ("Motor_*",),
+        "flags_on_loss": 1,
+    }
     new = replace(old, send_type={"y": "Event"}, unbound="start_value", **later)
     setup = CaptureSetup((EscSettings(),), ("-",), ("my.dbc", b""), new, False)
     header = json.loads(json.dumps(setup.header()))
@@ -461,7 +477,15 @@ def test_a_comment_that_looks_like_a_baud_rate_is_kept() -> None:
     assert message.comment == comment
 
 
-@pytest.mark.parametrize(("order", "said"), [("2", "2"), ("3", "3"), ("10", "10"), ("01", "01")])
+@pytest.mark.parametrize(
+    ("order", "said"),
+    [
+        ("2", "2"),
+        ("3", "3"),
+        ("10", "10"),
+        ("01", "01"),
+    ],
+)
 def test_an_unknown_byte_order_is_refused_with_the_name_of_the_signal(
     order: str, said: str
 ) -> None:
@@ -511,7 +535,9 @@ def test_a_message_with_a_transmitter_is_not_selected_by_name_alone() -> None:
     [("12.5", 12_500_000), ("0.25", MS), ("33.333", 33_333_000), ("10", 10 * MS)],
 )
 def test_a_cycle_time_with_a_fraction_is_exact_or_causes_a_warning(
-    kind: str, written: str, used_ns: int
+    kind: str,
+    written: str,
+    used_ns: int,
 ) -> None:
     quoted = f'"{written}"' if kind == "STRING" else written
     default = '""' if kind == "STRING" else "0"

@@ -38,7 +38,10 @@ PAIR = escs("left", "right")
 
 
 def multiplied(
-    text: str, escs: Sequence[EscSettings], node: str = "Gateway", **more: Any
+    text: str,
+    escs: Sequence[EscSettings],
+    node: str = "Gateway",
+    **more: Any,
 ) -> tuple[Database, str]:
     """Return the DBC for these ESCs, as a database and as text."""
     plain = read(text)
@@ -181,7 +184,10 @@ def simple(*ids: int, extended: bool = False, gateway: tuple[int, ...] = ()) -> 
     ],
 )  # fmt: skip
 def test_ids_are_moved_by_the_smallest_step_without_a_clash(
-    text: str, base: int | None, step: int | None, expected: list[int]
+    text: str,
+    base: int | None,
+    step: int | None,
+    expected: list[int],
 ) -> None:
     after, _ = multiplied(text, PAIR, base_id=base, id_step=step)
     assert [message.frame_id for message in after.messages] == expected
@@ -199,7 +205,10 @@ def test_ids_are_moved_by_the_smallest_step_without_a_clash(
     ],
 )
 def test_ids_that_clash_or_leave_their_range_are_refused(
-    text: str, escs: list[EscSettings], more: dict[str, Any], words: str
+    text: str,
+    escs: list[EscSettings],
+    more: dict[str, Any],
+    words: str,
 ) -> None:
     (line,) = refused(text, [esc.name for esc in escs], node="Gateway", **more)
     assert words in line
@@ -252,10 +261,20 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
     assert plain_plans(new) == plain_plans(old)
 
 
-@pytest.mark.parametrize(("text", "node"), [(SHIPPED, "KontronikGateway"), (RICH, "Gw")])
+@pytest.mark.parametrize(
+    ("text", "node"),
+    [
+        (SHIPPED, "KontronikGateway"),
+        (RICH, "Gw"),
+    ],
+)
 def test_the_written_file_compiles_to_the_plans_that_are_sent(text: str, node: str) -> None:
     """Two of the ESCs are alike and share a plan. It equals the plan of each compiled alone."""
-    three = [EscSettings("left", 7), EscSettings("mid", 14), EscSettings("right", 7)]
+    three = [
+        EscSettings("left", 7),
+        EscSettings("mid", 14),
+        EscSettings("right", 7),
+    ]
     settings = DbcConfig(node=node)
     written, _ = multiplied(text, three, node)
     sent = prepare(read(text), "x", three, settings, fd_allowed=True)

@@ -101,7 +101,11 @@ FD = 14
 
 
 def layout_of(
-    message: Msg, kind: int = CYCLIC, cycle: int = 10, delay: int = 0, frame_format: int = NO_FD
+    message: Msg,
+    kind: int = CYCLIC,
+    cycle: int = 10,
+    delay: int = 0,
+    frame_format: int = NO_FD,
 ) -> Layout:
     if frame_format:
         frame_format += message.extended
@@ -137,7 +141,11 @@ def message_of(*names: str, length: int = 8, extended: bool = False) -> Msg:
     ],
 )
 def test_a_frame_is_counted_with_its_bits_and_the_most_stuff_bits(
-    length: int, extended: bool, frame_format: int, nominal: int, at_data_rate: int
+    length: int,
+    extended: bool,
+    frame_format: int,
+    nominal: int,
+    at_data_rate: int,
 ) -> None:
     message = message_of("LeftBatteryVoltage", length=length, extended=extended)
     layout = layout_of(message, frame_format=frame_format)
@@ -164,7 +172,11 @@ def test_a_frame_is_counted_with_its_bits_and_the_most_stuff_bits(
     ],
 )  # fmt: skip
 def test_a_message_is_counted_as_if_each_esc_sent_at_100_hz(
-    names: tuple[str, ...], kind: int, cycle: int, delay: int, frames_a_second: float
+    names: tuple[str, ...],
+    kind: int,
+    cycle: int,
+    delay: int,
+    frames_a_second: float,
 ) -> None:
     layout = layout_of(message_of(*names), kind, cycle, delay)
     assert layout.bus_load(1_000_000) == pytest.approx(frames_a_second * 135e-6, rel=1e-12)
@@ -183,7 +195,11 @@ def test_a_message_is_counted_as_if_each_esc_sent_at_100_hz(
     ],
 )  # fmt: skip
 def test_the_worst_load_counts_each_change(
-    names: tuple[str, ...], kind: int, cycle: int, delay: int, frames_a_second: float
+    names: tuple[str, ...],
+    kind: int,
+    cycle: int,
+    delay: int,
+    frames_a_second: float,
 ) -> None:
     layout = layout_of(message_of(*names), kind, cycle, delay)
     worst = layout.bus_load(1_000_000, is_worst=True)

@@ -84,7 +84,12 @@ class Bench:
         self.gateway.receive_bytes(esc, b"".join(frames), self.now, self.now)
         self.take()
 
-    def feed(self, until: int, period: int = 10 * MS, data: LiveData = LIVE) -> None:
+    def feed(
+        self,
+        until: int,
+        period: int = 10 * MS,
+        data: LiveData = LIVE,
+    ) -> None:
         """Receive live frames of the first ESC at regular intervals."""
         while self.now + period <= until:
             self.until(self.now + period)
@@ -94,7 +99,12 @@ class Bench:
         """Return the times of sending of a message, in ms."""
         return [when // MS for when, frame in self.sent if frame.can_id == can_id]
 
-    def raws(self, length: int = 16, start: int = 0, can_id: int = 0x100) -> list[int]:
+    def raws(
+        self,
+        length: int = 16,
+        start: int = 0,
+        can_id: int = 0x100,
+    ) -> list[int]:
         """Return the raw values of a signal in all frames of a message."""
         frames = [frame for _, frame in self.sent if frame.can_id == can_id]
         return [get(frame.data, start, length, True) for frame in frames]
@@ -103,7 +113,12 @@ class Bench:
         self.sent.clear()
 
 
-def lone(kind: int, cycle: int = 0, delay: int = 0, *more: Sig) -> Bench:
+def lone(
+    kind: int,
+    cycle: int = 0,
+    delay: int = 0,
+    *more: Sig,
+) -> Bench:
     """Return the bench of a gateway with one message."""
     message = Msg("EscPower", 0x100, 8, [VOLTAGE, *more])
     return Bench([(message, kind, cycle, delay)])
@@ -330,7 +345,12 @@ def test_an_event_message_with_link_values_is_sent_with_each_live_frame() -> Non
 
 
 def test_silent_stops_messages_with_values_but_not_the_link_status() -> None:
-    kinds = [(CYCLIC, 20), (EVENT, 0), (ON_CHANGE, 0), (CYCLIC_AND_EVENT, 50)]
+    kinds = [
+        (CYCLIC, 20),
+        (EVENT, 0),
+        (ON_CHANGE, 0),
+        (CYCLIC_AND_EVENT, 50),
+    ]
     link = [
         Sig("LinkState", 0, 8),
         Sig("Losses", 8, 8),
@@ -392,7 +412,12 @@ def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
 # --- alive counter, pages
 
 
-def paged(kind: int, cycle: int, delay: int = 0, start: bool = False) -> Bench:
+def paged(
+    kind: int,
+    cycle: int,
+    delay: int = 0,
+    start: bool = False,
+) -> Bench:
     """Return the bench of a gateway with a message of three pages."""
     signals = [
         Sig("Page", 0, 8, mux="M"),
@@ -429,7 +454,13 @@ def test_after_a_loss_each_page_is_sent_as_not_available(kind: int, delay: int) 
     assert last == NOTHING
 
 
-@pytest.mark.parametrize(("kind", "cycle"), [(CYCLIC, 10), (EVENT, 0)])
+@pytest.mark.parametrize(
+    ("kind", "cycle"),
+    [
+        (CYCLIC, 10),
+        (EVENT, 0),
+    ],
+)
 def test_multiplexer_pages_take_turns(kind: int, cycle: int) -> None:
     bench = paged(kind, cycle)
     bench.until(15 * MS)
@@ -463,7 +494,11 @@ def test_a_cycle_sends_its_page_in_addition_to_a_changed_page_put_off() -> None:
     ]
     message = Msg("EscPaged", 0x100, 8, signals)
     bench = Bench([(message, CYCLIC_AND_ON_CHANGE, 100, 30)])
-    for at, throttle in ((130, 0), (190, 5), (210, 6)):
+    for at, throttle in (
+        (130, 0),
+        (190, 5),
+        (210, 6),
+    ):
         bench.until(at * MS)
         bench.live(volts(1)._replace(throttle=throttle))
     bench.until(290 * MS)
@@ -540,7 +575,10 @@ STEP = st.tuples(st.integers(0, 400), st.sampled_from(["live", "lost", "wait"]))
     st.booleans(),
 )
 def test_frames_keep_the_time_out_and_the_minimum_distance(
-    steps: list[tuple[int, str]], kind: int, delay: int, late: bool
+    steps: list[tuple[int, str]],
+    kind: int,
+    delay: int,
+    late: bool,
 ) -> None:
     is_cyclic = kind in (CYCLIC, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE)
     bench = lone(kind, 40 if is_cyclic else 0, delay)

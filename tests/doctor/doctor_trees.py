@@ -55,14 +55,23 @@ class Tree(Machine):
         self.path(name).symlink_to(self.path(target))
 
     def device(
-        self, name: str, number: tuple[int, int], mode: int = 0o660, group: int = DIALOUT
+        self,
+        name: str,
+        number: tuple[int, int],
+        mode: int = 0o660,
+        group: int = DIALOUT,
     ) -> None:
         """Create a character device whose owner is root."""
         self.file(name, "")
         values = (stat.S_IFCHR | mode, 0, 0, 1, 0, group, 0, 0, 0, 0)
         self.devices[name] = os.stat_result(values, {"st_rdev": os.makedev(*number)})
 
-    def process(self, pid: int, *words: str, opens: Sequence[str] = ()) -> None:
+    def process(
+        self,
+        pid: int,
+        *words: str,
+        opens: Sequence[str] = (),
+    ) -> None:
         self.file(f"/proc/{pid}/comm", words[0].rpartition("/")[2][:15] + "\n")
         self.file(f"/proc/{pid}/cmdline", "\0".join(words) + "\0")
         self.folder(f"/proc/{pid}/fd")

@@ -102,7 +102,12 @@ DOWN = {"flags": "0x40040"}
     ],
 )  # fmt: skip
 def test_a_wrong_setting_is_reported_with_the_command_that_corrects_it(
-    tree: Tree, change: dict[str, Any], can: CanConfig, check: str, severity: str, said: str
+    tree: Tree,
+    change: dict[str, Any],
+    can: CanConfig,
+    check: str,
+    severity: str,
+    said: str,
 ) -> None:
     interface(tree, change)
     findings = check_can(tree, can)
@@ -137,7 +142,11 @@ def test_vcan_has_its_own_commands_even_without_ip(tree: Tree) -> None:
     assert only(check_can(tree, vcan0), "can.exists").command == add
     tree.file("/sys/class/net/can1/type", "280\n")
     assert only(check_can(tree, vcan0), "can.exists").command == add
-    for name, text in (("type", "280"), ("flags", "0x80"), ("mtu", "16")):
+    for name, text in (
+        ("type", "280"),
+        ("flags", "0x80"),
+        ("mtu", "16"),
+    ):
         tree.file(f"/sys/class/net/vcan0/{name}", f"{text}\n")
     found = check_can(tree, vcan0)
     assert only(found, "can.up").command == "sudo ip link set vcan0 up"

@@ -78,7 +78,13 @@ def test_a_usable_setup_has_exit_code_0_and_plain_text_in_a_pipe(
     ],
 )  # fmt: skip
 def test_an_error_has_its_exit_code_and_the_rest_is_still_checked(
-    more: str, port: str, code: int, checks: list[str], said: str, tmp_path: Path, esc: PtyEsc
+    more: str,
+    port: str,
+    code: int,
+    checks: list[str],
+    said: str,
+    tmp_path: Path,
+    esc: PtyEsc,
 ) -> None:
     written(tmp_path / "afile", "")
     findings, errors = document(configuration(tmp_path, port or esc.path, more), code)

@@ -46,7 +46,11 @@ def service(tree: Tree) -> list[Finding]:
     ],
 )
 def test_the_state_of_the_service_is_reported(
-    tree: Tree, shown: dict[str, str], check: str, severity: str, word: str
+    tree: Tree,
+    shown: dict[str, str],
+    check: str,
+    severity: str,
+    word: str,
 ) -> None:
     tree.systemd(**shown)
     findings = service(tree)
@@ -84,7 +88,12 @@ def test_without_systemd_an_installation_is_not_advised(tree: Tree, folder: str)
     ],
 )
 def test_a_folder_must_be_writable_by_this_user_or_systemd(
-    tree: Tree, there: str, space: tuple[bool, int], who: str, severity: str, said: str
+    tree: Tree,
+    there: str,
+    space: tuple[bool, int],
+    who: str,
+    severity: str,
+    said: str,
 ) -> None:
     tree.folder(there)
     tree.full[there] = space

@@ -62,7 +62,13 @@ BRLTTY = methodcaller("process", 78, "/usr/bin/brltty")
 MINICOM = methodcaller("process", 78, "minicom", opens=[USB0])
 GATEWAY = methodcaller("process", 78, *RUN, opens=[USB0])
 INSTALLED = methodcaller(
-    "process", 78, "/usr/bin/python3", "/opt/bin/kontronik-can-gw", "run", "--wait", opens=[USB0]
+    "process",
+    78,
+    "/usr/bin/python3",
+    "/opt/bin/kontronik-can-gw",
+    "run",
+    "--wait",
+    opens=[USB0],
 )
 
 
@@ -98,7 +104,12 @@ INSTALLED = methodcaller(
     ],
 )  # fmt: skip
 def test_findings_at_a_port_are_reported(
-    tree: Tree, given: list[Set], port: str, name: str, severity: str, said: str
+    tree: Tree,
+    given: list[Set],
+    port: str,
+    name: str,
+    severity: str,
+    said: str,
 ) -> None:
     for each in given:
         each(tree)

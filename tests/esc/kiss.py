@@ -100,7 +100,13 @@ def crc8(data: bytes) -> int:
     return crc
 
 
-def frame(temperature: int, voltage: int, current: int, charge: int, speed: int) -> bytes:
+def frame(
+    temperature: int,
+    voltage: int,
+    current: int,
+    charge: int,
+    speed: int,
+) -> bytes:
     """Return the bytes of a frame with these raw values."""
     body = _BODY.pack(temperature, voltage, current, charge, speed)
     return body + bytes((crc8(body),))

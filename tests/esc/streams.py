@@ -24,7 +24,12 @@ def decoded(form: Form, buffer: bytes, at: int = 0) -> Data:
     return form.data_type(*form.unpack_fields(buffer, at))
 
 
-def overlapping_pair(first: FormRow, second: FormRow, shared: int, source: random.Random) -> bytes:
+def overlapping_pair(
+    first: FormRow,
+    second: FormRow,
+    shared: int,
+    source: random.Random,
+) -> bytes:
     """Return two valid frames that share the last ``shared`` bytes of the first."""
     start = first.length - shared
     assert 4 <= start <= first.covered - 4

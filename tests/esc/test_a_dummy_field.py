@@ -63,7 +63,11 @@ print(json.dumps({
 
 def _shown(folder: Path) -> dict[str, Any]:
     done = subprocess.run(
-        [sys.executable, "-c", SHOW], cwd=folder, capture_output=True, text=True, check=False
+        [sys.executable, "-c", SHOW],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
@@ -73,7 +77,9 @@ def _shown(folder: Path) -> dict[str, Any]:
 
 def test_a_new_first_field_changes_no_other_value(tmp_path: Path) -> None:
     copy = shutil.copytree(
-        PACKAGE, tmp_path / "kontronik_can_gw", ignore=shutil.ignore_patterns("__pycache__")
+        PACKAGE,
+        tmp_path / "kontronik_can_gw",
+        ignore=shutil.ignore_patterns("__pycache__"),
     )
     for name in ("dbc", "eds"):
         if (PACKAGE.parent / name).is_dir():

@@ -109,7 +109,9 @@ def test_raw_values_survive_a_round_trip_with_any_reserved_bytes(
     ],
 )
 def test_changed_unprotected_byte_is_delivered_and_maybe_suspect(
-    frame: bytes, offset: int, name: str
+    frame: bytes,
+    offset: int,
+    name: str,
 ) -> None:
     for value in range(256):
         found = frame_in(frame[:offset] + bytes((value,)) + frame[offset + 1 :])
@@ -157,10 +159,18 @@ def test_error_bit_has_the_meaning_of_the_sheet(names: type[ErrorBit], bits: lis
 
 
 def test_parts_of_a_word_are_read_separately_and_written_together() -> None:
-    for device, variant, word in ((3, 120, 0x0C78), (63, 1023, 0xFFFF), (1, 0, 0x400)):
+    for device, variant, word in (
+        (3, 120, 0x0C78),
+        (63, 1023, 0xFFFF),
+        (1, 0, 0x400),
+    ):
         assert device_and_variant(device, variant) == word
         info = InfoData(device_and_variant=word)
         assert KONTRONIK.value("device_raw", info) == device
         assert KONTRONIK.value("variant", info) == variant
-    for word, text in ((0x010E, "1.14"), (0x0300, "3.0"), (0xFFFF, "255.255")):
+    for word, text in (
+        (0x010E, "1.14"),
+        (0x0300, "3.0"),
+        (0xFFFF, "255.255"),
+    ):
         assert KONTRONIK.firmware_text(InfoData(firmware_word=word)) == text

@@ -154,9 +154,18 @@ HOSTILE = (
 
 
 @pytest.mark.parametrize("unit", HOSTILE, ids=lambda unit: repr(unit[:9]))
-@pytest.mark.parametrize("cut", [one_by_one, lambda stream: [stream]], ids=["bytes", "whole"])
+@pytest.mark.parametrize(
+    "cut",
+    [
+        one_by_one,
+        lambda stream: [stream],
+    ],
+    ids=["bytes", "whole"],
+)
 def test_work_on_hostile_input_is_linear(
-    unit: bytes, cut: Callable[[bytes], list[bytes]], monkeypatch: pytest.MonkeyPatch
+    unit: bytes,
+    cut: Callable[[bytes], list[bytes]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     calculated: list[int] = []
 

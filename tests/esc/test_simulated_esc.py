@@ -65,7 +65,10 @@ def test_every_frame_of_any_profile_decodes_to_its_data(options: EscOptions, see
     assert {frame.layout for frame in found} == {layout}
 
 
-@given(cuts=st.lists(st.integers(0, 20 * S), max_size=20), seed=st.integers(0, 5))
+@given(
+    cuts=st.lists(st.integers(0, 20 * S), max_size=20),
+    seed=st.integers(0, 5),
+)
 @settings(max_examples=8, deadline=None)
 def test_same_seed_gives_same_bytes_for_any_spacing_of_calls(cuts: list[int], seed: int) -> None:
     options = EscOptions(faults=Faults(flipped_bits=0.001, dropout=Dropout(S, 3 * S)))
@@ -97,7 +100,13 @@ def test_flight_is_physically_plausible(device: Device) -> None:
     assert flight[-1].electrical_speed == 0  # the peak is held although the motor is at rest
 
 
-@pytest.mark.parametrize(("layout", "covered"), [(Layout.V4, 36), (Layout.LEGACY, 32)])
+@pytest.mark.parametrize(
+    ("layout", "covered"),
+    [
+        (Layout.V4, 36),
+        (Layout.LEGACY, 32),
+    ],
+)
 def test_receiver_finds_exactly_the_intact_frames(layout: Layout, covered: int) -> None:
     """In the legacy layout, frames with flipped bits outside the CRC are found as well."""
     options = EscOptions(layout=layout, faults=Faults(flipped_bits=0.001))
@@ -117,7 +126,10 @@ def test_requested_error_bits_and_swapped_devices_are_sent() -> None:
         ErrorWindow(OperatingError.BEC_OVERCURRENT, 6 * S),
         ErrorWindow(SelfTestError.TEST_EEPROM_SIZE, 3 * S, 3 * S),
     )
-    swaps = (Swap(20 * S, Device.JIVEPRO), Swap(30 * S, Device.UHV, Layout.LEGACY))
+    swaps = (
+        Swap(20 * S, Device.JIVEPRO),
+        Swap(30 * S, Device.UHV, Layout.LEGACY),
+    )
     esc = SimulatedEsc(EscOptions(faults=Faults(errors=errors, swaps=swaps)))
     frames = esc.frames_until(40 * S)
     assert esc.device == Device.UHV

@@ -50,7 +50,12 @@ def esc(timeout_ns: int = TIMEOUT) -> EscStream:
     return EscStream(EscSettings(timeout_ns=timeout_ns), 0)
 
 
-def read(telemetry: EscStream, data: bytes, now: int, since: int | None = None) -> int:
+def read(
+    telemetry: EscStream,
+    data: bytes,
+    now: int,
+    since: int | None = None,
+) -> int:
     """Pass bytes that arrived after ``since``, by default just now. Return all events."""
     if since is None:
         since = now
@@ -67,7 +72,12 @@ def alive(now: int = SECOND) -> EscStream:
     return telemetry
 
 
-def stream(telemetry: EscStream, begin: int, seconds: float, extra: bytes = b"") -> int:
+def stream(
+    telemetry: EscStream,
+    begin: int,
+    seconds: float,
+    extra: bytes = b"",
+) -> int:
     """Pass a frame every 10 ms, and call ``advance`` at each deadline. Return the last time."""
     now = begin
     while now < begin + seconds * SECOND:
@@ -91,7 +101,9 @@ def stream(telemetry: EscStream, begin: int, seconds: float, extra: bytes = b"")
     ],
 )
 def test_bad_second_degrades_the_link_and_clean_second_restores_it(
-    broken: int, noise: int, state: LinkState
+    broken: int,
+    noise: int,
+    state: LinkState,
 ) -> None:
     telemetry = alive(SECOND)
     for n in range(broken):
@@ -130,7 +142,13 @@ def test_lost_port_is_an_error_until_it_is_reopened(seen: bool) -> None:
 # --- freshness
 
 
-@pytest.mark.parametrize(("gap", "taken"), [(TIMEOUT, True), (TIMEOUT + 1, False)])
+@pytest.mark.parametrize(
+    ("gap", "taken"),
+    [
+        (TIMEOUT, True),
+        (TIMEOUT + 1, False),
+    ],
+)
 def test_frame_with_a_first_byte_older_than_the_time_out_is_dropped(gap: int, taken: bool) -> None:
     telemetry = esc()
     frame = live()
@@ -169,8 +187,22 @@ WIRE = 39 * NS_PER_BYTE
 """Time from the first byte of a live frame to its last."""
 
 
-@pytest.mark.parametrize("known", [False, True], ids=["interval not known yet", "100 Hz"])
-@pytest.mark.parametrize("noise", [0, 1], ids=["a frame alone", "with another byte"])
+@pytest.mark.parametrize(
+    "known",
+    [
+        False,
+        True,
+    ],
+    ids=["interval not known yet", "100 Hz"],
+)
+@pytest.mark.parametrize(
+    "noise",
+    [
+        0,
+        1,
+    ],
+    ids=["a frame alone", "with another byte"],
+)
 @pytest.mark.parametrize(
     ("waited", "bound", "shown"),
     # Time since the port was empty, since the earliest end of the frame, and age shown if the
@@ -186,7 +218,11 @@ WIRE = 39 * NS_PER_BYTE
     ],
 )
 def test_time_outs_and_old_ages_count_from_the_earliest_arrival(
-    known: bool, noise: int, waited: int, bound: int | None, shown: int | None
+    known: bool,
+    noise: int,
+    waited: int,
+    bound: int | None,
+    shown: int | None,
 ) -> None:
     telemetry = esc()
     now = TIMEOUT + (stream(telemetry, SECOND, 2.5) if known else SECOND)

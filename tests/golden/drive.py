@@ -28,7 +28,11 @@ FOLDERS = {str(shipped("dbc").parent): "SHIPPED"}
 
 
 def frame(
-    can_id: int, data: bytes, extended: bool = False, fd: bool = False, remote: bool = False
+    can_id: int,
+    data: bytes,
+    extended: bool = False,
+    fd: bool = False,
+    remote: bool = False,
 ) -> CanFrame:
     """Return a frame on the bus."""
     return CanFrame(can_id, data, extended, fd, remote=remote)

@@ -18,7 +18,12 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent / "signals"), str(HERE.parents[1])]
+sys.path[:0] = [
+    str(HERE),
+    str(HERE.parent),
+    str(HERE.parent / "signals"),
+    str(HERE.parents[1]),
+]
 
 import drive  # noqa: E402
 import meaning  # noqa: E402
@@ -52,7 +57,12 @@ class Judge:
     ``wrong`` has a line for each wrong value, ``count`` the numbers of judged frames and values.
     """
 
-    def __init__(self, escs: list[Esc], database: Database | None, node_ids: list[int]) -> None:
+    def __init__(
+        self,
+        escs: list[Esc],
+        database: Database | None,
+        node_ids: list[int],
+    ) -> None:
         self.escs = escs
         self.database = database
         self.node_ids = node_ids
@@ -127,7 +137,12 @@ class Judge:
             self._message(now, frame, self.database, frame.can_id, None)
 
     def _message(
-        self, now: int, frame: drive.CanFrame, database: Database, can_id: int, owner: Esc | None
+        self,
+        now: int,
+        frame: drive.CanFrame,
+        database: Database,
+        can_id: int,
+        owner: Esc | None,
     ) -> None:
         message = _by_id(database).get((can_id, frame.extended))
         if message is None:
@@ -147,7 +162,13 @@ class Judge:
         return next(named, self.escs[0])
 
     def _signal(
-        self, now: int, message: str, signal: Signal, raw: float, esc: Esc, pdo: bool
+        self,
+        now: int,
+        message: str,
+        signal: Signal,
+        raw: float,
+        esc: Esc,
+        pdo: bool,
     ) -> None:
         name = signal.name.removeprefix(esc.prefix)
         states = esc.passed or [esc.state]

@@ -94,7 +94,13 @@ class Esc:
     def lose(self) -> None:
         self.state = self.state._replace(live=None, info=None)
 
-    def take(self, kind: str, layout: str, values: Values, when: int) -> None:
+    def take(
+        self,
+        kind: str,
+        layout: str,
+        values: Values,
+        when: int,
+    ) -> None:
         """Receive a frame whose last byte arrived at ``when``."""
         number = 1 if layout == "v4" else 2
         if number != self.state.layout:
@@ -129,7 +135,13 @@ def found_frames(inputs: list[Bytes], timeout: int) -> list[Arrivals | None]:
     return results
 
 
-def _search(inputs: list[Bytes], begin: int, end: int, timeout: int, found: list[Arrivals]) -> None:
+def _search(
+    inputs: list[Bytes],
+    begin: int,
+    end: int,
+    timeout: int,
+    found: list[Arrivals],
+) -> None:
     """Add the frames of the inputs from ``begin`` to ``end`` to ``found``."""
     parts = [data or b"" for _, data in inputs[begin:end]]
     stream = b"".join(parts)
@@ -170,7 +182,12 @@ def _as_object(values: Values | None) -> SimpleNamespace | None:
     return None if values is None else SimpleNamespace(**values)
 
 
-def expected(name: str, esc: Esc, state: State, now: int) -> Fraction | int | None:
+def expected(
+    name: str,
+    esc: Esc,
+    state: State,
+    now: int,
+) -> Fraction | int | None:
     """Return the correct value of a signal, in the unit of the sheet.
 
     Returns None if the value is not available. KeyError if the value is not judged.
@@ -191,7 +208,12 @@ def expected(name: str, esc: Esc, state: State, now: int) -> Fraction | int | No
     return KNOWN[plain].read(made, of_gateway, now)
 
 
-def fits(signal: Signal, raw: float, value: Fraction | int | None, unit: str) -> bool:
+def fits(
+    signal: Signal,
+    raw: float,
+    value: Fraction | int | None,
+    unit: str,
+) -> bool:
     """Return True if the raw value is correct for a value in this unit."""
     texts: dict[str, int] = {}
     for number, text in (signal.choices or {}).items():
@@ -224,7 +246,10 @@ def _is_not_available(signal: Signal, raw: float, texts: Mapping[str, int]) -> b
 
 
 def _is_out_of_range(
-    signal: Signal, ideal: float, value: Fraction, texts: Mapping[str, int]
+    signal: Signal,
+    ideal: float,
+    value: Fraction,
+    texts: Mapping[str, int],
 ) -> bool:
     """Return True if a value has no name in an enumeration, or is outside the signal's limits."""
     numbers = [number for text, number in texts.items() if text not in ("NotAvailable", "Error")]

@@ -112,7 +112,10 @@ def dbc_short(data: bytes) -> list[str]:
 
 def _sections(data: bytes) -> configparser.ConfigParser:
     found = configparser.ConfigParser(
-        strict=True, interpolation=None, comment_prefixes=(";",), delimiters=("=",)
+        strict=True,
+        interpolation=None,
+        comment_prefixes=(";",),
+        delimiters=("=",),
     )
     found.optionxform = str  # type: ignore[assignment, method-assign]
     found.read_string(data.decode("latin-1"))

@@ -13,7 +13,11 @@ from difflib import unified_diff
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parents[1])]
+sys.path[:0] = [
+    str(HERE),
+    str(HERE.parent),
+    str(HERE.parents[1]),
+]
 
 import commands  # noqa: E402
 import scenario  # noqa: E402
@@ -74,7 +78,9 @@ def main() -> int:
     """Record or check the files that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--check", action="store_true", help="write nothing; exit code 1 if anything is different"
+        "--check",
+        action="store_true",
+        help="write nothing; exit code 1 if anything is different",
     )
     parser.add_argument("words", nargs="*", help="only files whose names hold one of these")
     args = parser.parse_args()

@@ -157,7 +157,13 @@ class Player:
         assert len(answers) < 2, "several answers"
         return answers[0] if answers else None
 
-    def _sdo(self, verb: str, node: int, entry: str, data: bytes) -> str:
+    def _sdo(
+        self,
+        verb: str,
+        node: int,
+        entry: str,
+        data: bytes,
+    ) -> str:
         """Make an SDO transfer, expedited or in segments.
 
         Returns ``= data`` for a read, ``! code`` for an abort, and "" for a write or without an
@@ -213,7 +219,9 @@ def changed_eds(changes: Mapping[str, Mapping[str, str]]) -> str:
     text = shipped_eds()
     for section, keys in changes.items():
         found = re.search(
-            rf"^\[{section}\]\r?\n(?:(?!\[).*\r?\n)*", text, re.MULTILINE | re.IGNORECASE
+            rf"^\[{section}\]\r?\n(?:(?!\[).*\r?\n)*",
+            text,
+            re.MULTILINE | re.IGNORECASE,
         )
         assert found is not None, f"no section {section}"
         body = found[0]

@@ -23,7 +23,11 @@ from typing import Any
 
 if __name__ == "__main__":
     tests = Path(__file__).resolve().parents[1]
-    sys.path[:0] = [str(tests.parent), str(tests), str(tests / "capture")]
+    sys.path[:0] = [
+        str(tests.parent),
+        str(tests),
+        str(tests / "capture"),
+    ]
 
 import can
 import numpy as np
@@ -45,7 +49,13 @@ class Verdict:
     values: int = 0
     problems: list[str] = field(default_factory=list)
 
-    def compare(self, what: str, got: Any, wanted: Any, slack: float = 0.0) -> None:
+    def compare(
+        self,
+        what: str,
+        got: Any,
+        wanted: Any,
+        slack: float = 0.0,
+    ) -> None:
         """Compare two columns. NaN equals NaN."""
         if len(got) != len(wanted):
             self.problems.append(f"{what}: {len(got)}, must be {len(wanted)}")

@@ -103,7 +103,11 @@ FAULTS: tuple[tuple[str, str, Edit], ...] = (
 
 @pytest.mark.parametrize(("file", "what", "edit"), FAULTS, ids=lambda given: str(given)[:12])
 def test_a_falsified_file_is_detected(
-    file: str, what: str, edit: Edit, minute: Minute, tmp_path: Path
+    file: str,
+    what: str,
+    edit: Edit,
+    minute: Minute,
+    tmp_path: Path,
 ) -> None:
     lines = (minute.folder / file).read_text().splitlines(keepends=True)
     half = len(lines) // 2

@@ -210,7 +210,10 @@ def ask(port: int, path: str = "/metrics", **headers: str) -> tuple[int, str, st
 
 
 def test_newest_metrics_are_served_to_prometheus(
-    port: int, file: Path, clock: Clock, document: dict[str, Any]
+    port: int,
+    file: Path,
+    clock: Clock,
+    document: dict[str, Any],
 ) -> None:
     for accept in ("*/*", "application/openmetrics-text;version=1.0.0", "a/b;version=x;;=,"):
         status, _, text = ask(port, Accept=accept)
@@ -224,7 +227,10 @@ def test_newest_metrics_are_served_to_prometheus(
     assert ask(port)[0] == 503
     file.write_text(json.dumps(document | {"version": "9.9.9"}))
     assert 'kontronik_build_info{version="9.9.9"} 1.0' in ask(port)[2]
-    for age_ns, said in ((STALE_NS + 9 * SECOND, "for 12.0 s"), (-STALE_NS - 1, "not running")):
+    for age_ns, said in (
+        (STALE_NS + 9 * SECOND, "for 12.0 s"),
+        (-STALE_NS - 1, "not running"),
+    ):
         clock.now = document["monotonic_ns"] + age_ns
         status, _, text = ask(port)
         assert status == 503
@@ -239,16 +245,29 @@ def test_newest_metrics_are_served_to_prometheus(
     ],
 )
 def test_request_with_a_foreign_host_name_is_refused(
-    port: int, status: int, hosts: list[str]
+    port: int,
+    status: int,
+    hosts: list[str],
 ) -> None:
     assert [ask(port, Host=host)[0] for host in hosts] == [status] * len(hosts)
 
 
 def test_damaged_file_is_one_line_without_a_traceback(
-    port: int, file: Path, document: dict[str, Any], capfd: pytest.CaptureFixture[str]
+    port: int,
+    file: Path,
+    document: dict[str, Any],
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     text = json.dumps(document)
-    damaged: list[object] = [None, 3, [], "x", {}, {"program": "x"}, document | {"format": 99}]
+    damaged: list[object] = [
+        None,
+        3,
+        [],
+        "x",
+        {},
+        {"program": "x"},
+        document | {"format": 99},
+    ]
     for key in ("can", "escs", "gateway", "monotonic_ns", "process", "units"):
         without = dict(document)
         del without[key]
@@ -266,7 +285,9 @@ def test_damaged_file_is_one_line_without_a_traceback(
 
 
 def test_clients_that_never_finish_delay_no_other_and_are_closed(
-    port: int, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    port: int,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     address = ("127.0.0.1", port)
     with (
@@ -299,7 +320,11 @@ def test_clients_that_never_finish_delay_no_other_and_are_closed(
     ],
 )
 def test_missing_library_is_reported_with_the_command_that_installs_it(
-    monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], package: str, said: str, extra: str
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    package: str,
+    said: str,
+    extra: str,
 ) -> None:
     for module in list(sys.modules):
         if module.startswith((package, f"kontronik_can_gw.desk.{extra}")):
@@ -309,7 +334,9 @@ def test_missing_library_is_reported_with_the_command_that_installs_it(
 
 
 def test_command_serves_the_configured_file_until_sigterm(
-    tmp_path: Path, port: int, file: Path
+    tmp_path: Path,
+    port: int,
+    file: Path,
 ) -> None:
     text = '[[esc]]\nport = "/dev/ttyS0"\n[statistics]\nfile = '
     toml = written(tmp_path / "g.toml", f'{text}"own.json"\n')

@@ -53,7 +53,12 @@ class Terminal:
             assert time.monotonic() < end, f"{what}: not within a minute:\n" + "\n".join(lines)
             time.sleep(0.05)
 
-    def type(self, key: str, wanted: Callable[[list[str]], object], what: str) -> None:
+    def type(
+        self,
+        key: str,
+        wanted: Callable[[list[str]], object],
+        what: str,
+    ) -> None:
         self.tmux("send-keys", key)
         self.until(wanted, what)
 

@@ -64,7 +64,13 @@ def test_the_monitor_has_no_code_that_sends() -> None:
                 assert "send" not in node.attr, f"{module.__name__}:{node.lineno}"
 
 
-@pytest.mark.parametrize("command", [["monitor"], ["mqtt", "--broker", "127.0.0.1:1"]])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["monitor"],
+        ["mqtt", "--broker", "127.0.0.1:1"],
+    ],
+)
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     tmp_path: Path, command: list[str]
 ) -> None:

@@ -62,7 +62,10 @@ def seen(count: int, kind: str = "good") -> Monitor:
 
 
 def texts(
-    monitor: Monitor, size: tuple[int, int], source: Source | None = None, page: int = 0
+    monitor: Monitor,
+    size: tuple[int, int],
+    source: Source | None = None,
+    page: int = 0,
 ) -> list[str]:
     """Return the lines of the screen without colours."""
     lines = screen(monitor, source or source_of(monitor), size, page)
@@ -77,7 +80,10 @@ def texts(
 )
 @settings(max_examples=30, deadline=None)
 def test_any_size_and_any_keys_are_accepted(
-    size: tuple[int, int], count: int, kind: str, keys: str
+    size: tuple[int, int],
+    count: int,
+    kind: str,
+    keys: str,
 ) -> None:
     monitor = seen(count, kind)
     page = 0
@@ -88,7 +94,14 @@ def test_any_size_and_any_keys_are_accepted(
     assert max(map(len, lines)) <= max(20, size[0])
 
 
-@pytest.mark.parametrize(("count", "size"), [(1, (60, 20)), (2, (120, 40)), (8, (80, 24))])
+@pytest.mark.parametrize(
+    ("count", "size"),
+    [
+        (1, (60, 20)),
+        (2, (120, 40)),
+        (8, (80, 24)),
+    ],
+)
 def test_important_lines_are_never_cut_off(size: tuple[int, int], count: int) -> None:
     monitor = seen(count, "errors")
     lines = texts(monitor, size)
@@ -147,7 +160,14 @@ def test_a_sparkline_of_several_lines_has_eight_steps_in_each() -> None:
     ]
 
 
-@pytest.mark.parametrize("size", [(80, 24), (80, 50), (120, 60)])
+@pytest.mark.parametrize(
+    "size",
+    [
+        (80, 24),
+        (80, 50),
+        (120, 60),
+    ],
+)
 def test_charts_of_one_esc_use_the_available_height(size: tuple[int, int]) -> None:
     monitor = seen(1)
     lines = texts(monitor, size)
@@ -171,7 +191,14 @@ def places_of_labels(lines: list[str]) -> list[int]:
     return [at for at, text in enumerate(lines) if text.startswith(tuple(LABELS))]
 
 
-@pytest.mark.parametrize(("size", "lines"), [((80, 24), 1), ((80, 50), 4), ((120, 60), 5)])
+@pytest.mark.parametrize(
+    ("size", "lines"),
+    [
+        ((80, 24), 1),
+        ((80, 50), 4),
+        ((120, 60), 5),
+    ],
+)
 def test_the_histories_of_all_escs_are_shown_below_their_table(
     size: tuple[int, int], lines: int
 ) -> None:

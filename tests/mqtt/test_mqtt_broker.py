@@ -51,7 +51,10 @@ class Mosquitto:
     """A broker that can be stopped and started again on the same port."""
 
     def __init__(
-        self, folder: Path, lines: str = "allow_anonymous true\n", port: int | None = None
+        self,
+        folder: Path,
+        lines: str = "allow_anonymous true\n",
+        port: int | None = None,
     ) -> None:
         self.port = port or free_port()
         self.address = f"127.0.0.1:{self.port}"
@@ -287,7 +290,10 @@ def live(tmp_path: Path) -> Iterator[Live]:
 
 
 def test_state_is_retained_and_reported_to_the_service_manager(
-    live: Live, broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    live: Live,
+    broker: Mosquitto,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     said = ""
     state = "kontronik/sd/online"

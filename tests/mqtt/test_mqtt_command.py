@@ -32,7 +32,11 @@ def configuration(folder: Path, mqtt: str) -> Path:
     ],
 )  # fmt: skip
 def test_mistake_is_one_line_with_a_remedy(
-    mqtt: str, words: list[str], code: int, said: str, tmp_path: Path
+    mqtt: str,
+    words: list[str],
+    code: int,
+    said: str,
+    tmp_path: Path,
 ) -> None:
     written(tmp_path / "empty", "\nx")
     assert said in refused(code, "mqtt", "-c", configuration(tmp_path, mqtt), *words)

@@ -59,7 +59,12 @@ def publisher(*names: str, rate: float = 1, **options: Any) -> Publisher:
 Published = list[tuple[int, Publication]]
 
 
-def run(made: Publisher, frames: Timed, until_s: float, step_ns: int = STEP_NS) -> Published:
+def run(
+    made: Publisher,
+    frames: Timed,
+    until_s: float,
+    step_ns: int = STEP_NS,
+) -> Published:
     """Pass the frames at their times, and collect the messages at each step."""
     published: Published = []
     waiting = list(reversed(frames))
@@ -101,8 +106,10 @@ def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any
         for name, value in decoded.items():
             if not name.startswith(prefix):
                 continue
-            plain = value if isinstance(value, (int, float)) else str(value)
-            if plain in ("NotAvailable", "Error"):
+            plain: float | str | None = str(value)
+            if isinstance(value, (int, float)):
+                plain = value
+            elif plain in ("NotAvailable", "Error"):
                 plain = None
             found[snake(name, prefix)] = plain
     return found
@@ -111,7 +118,13 @@ def by_cantools(database: Database, frames: Timed, prefix: str) -> dict[str, Any
 # --- content
 
 
-@pytest.mark.parametrize("names", [("esc1",), ("left", "right")])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("esc1",),
+        ("left", "right"),
+    ],
+)
 def test_json_has_each_value_as_cantools_decodes_it(names: tuple[str, ...]) -> None:
     bus = layout_of(names)
     database = read(copies_text(bus.database, [*bus.copies().values()]))

@@ -109,7 +109,11 @@ def tested(copy: Path, tests: tuple[str, ...], core_in_c: bool) -> int | str:
     environment = environment_of(copy, core_in_c)
     try:
         done = subprocess.run(
-            command, cwd=copy, env=environment, capture_output=True, timeout=LIMIT_S
+            command,
+            cwd=copy,
+            env=environment,
+            capture_output=True,
+            timeout=LIMIT_S,
         )
     except subprocess.TimeoutExpired:
         return FAILED  # the fault lets a test wait for ever

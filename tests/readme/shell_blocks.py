@@ -77,7 +77,12 @@ def make_files(folder: Path, channel: str, seconds: float) -> None:
     (folder / "examples").symlink_to(PROJECT / "examples")
 
 
-def run_block(block: Block, folder: Path, before: str = "", *around: str) -> str:
+def run_block(
+    block: Block,
+    folder: Path,
+    before: str = "",
+    *around: str,
+) -> str:
     """Run a block in a folder with bash and return its output.
 
     A failing command fails the test. All processes that the block has started are ended.

@@ -188,7 +188,9 @@ def given(block: Block) -> object:
 
 @pytest.mark.parametrize("block", [given(block) for block in blocks("")])
 def test_a_shell_block_can_be_typed_as_it_is_written(
-    block: Block, files: Path, tmp_path: Path
+    block: Block,
+    files: Path,
+    tmp_path: Path,
 ) -> None:
     for program, package in NEEDS.items():
         if f"{program} -" in block.text and shutil.which(program) is None:

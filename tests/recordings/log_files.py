@@ -51,7 +51,10 @@ def some_frames(count: int, seed: int = 1, fd: bool = False) -> list[Item]:
 
 
 def write_log(
-    path: Path, format_: str, items: list[Item], wall_start_ns: int | None = WALL_NS
+    path: Path,
+    format_: str,
+    items: list[Item],
+    wall_start_ns: int | None = WALL_NS,
 ) -> None:
     """Write a log with our own writer."""
     with path.open("wb") as file:

@@ -25,7 +25,10 @@ def convert(*words: object) -> int:
 
 @cache
 def capture_bytes(
-    escs: int = 2, seed: int = 3, seconds: float = 6, devices: Sequence[str] = ()
+    escs: int = 2,
+    seed: int = 3,
+    seconds: float = 6,
+    devices: Sequence[str] = (),
 ) -> bytes:
     """Return a capture file with all kinds of events.
 

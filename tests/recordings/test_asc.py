@@ -47,7 +47,12 @@ def test_the_id_of_a_symbolic_name_is_at_the_end_of_the_line(tmp_path: Path, bas
     """The id at the end is decimal in both bases. A name may look like a number, or end with x."""
     data = "00 00 00 C4 09 00 14 00" if base == "hex" else "0 0 0 196 9 0 20 0"
     tail = "  Length = 230000 BitCount = 119 ID = "
-    names = [("EscLive", "1672"), ("Face", "1673"), ("Matrix", "1674"), ("Far.Away", "74565x")]
+    names = [
+        ("EscLive", "1672"),
+        ("Face", "1673"),
+        ("Matrix", "1674"),
+        ("Far.Away", "74565x"),
+    ]
     found = _read(
         tmp_path / "names.asc",
         *(
@@ -105,7 +110,10 @@ def test_a_request_to_send_is_not_a_second_frame(tmp_path: Path) -> None:
     ],
 )
 def test_times_count_from_the_moment_that_fits(
-    tmp_path: Path, block: str, first: str, expected: str
+    tmp_path: Path,
+    block: str,
+    first: str,
+    expected: str,
 ) -> None:
     path = tmp_path / "start.asc"
     later = f"{float(first) + 0.01:.6f}"

@@ -135,7 +135,9 @@ def test_a_capture_has_no_channels(tmp_path: Path) -> None:
     ],
 )
 def test_each_channel_gets_a_unique_number_and_name(
-    channels: list[str], numbers: list[int], names: list[str]
+    channels: list[str],
+    numbers: list[int],
+    names: list[str],
 ) -> None:
     of_numbers = Channels("own")
     of_names = Channels("own")
@@ -147,7 +149,12 @@ def test_each_channel_gets_a_unique_number_and_name(
 def test_channels_of_logs_by_python_can_count_as_in_its_tools(tmp_path: Path) -> None:
     """python-can counts channels from 0, but ASC, BLF and the tools of their makers from 1."""
     data = bytes.fromhex("000000C409001400")
-    for suffix, name in ((".asc", "2"), (".blf", "2"), (".trc", "2"), (".mf4", "1")):
+    for suffix, name in (
+        (".asc", "2"),
+        (".blf", "2"),
+        (".trc", "2"),
+        (".mf4", "1"),
+    ):
         path = tmp_path / f"log{suffix}"
         with can.Logger(path) as writer:
             writer(can.Message(1_700_000_000.0, 0x688, False, data=data, channel=1))

@@ -135,7 +135,9 @@ def _read(
     ("count", "by_ms", "is_step"), [(10, 111, True), (9, 111, False), (10, 110, False)]
 )
 def test_ten_frames_that_go_back_by_more_than_100_ms_are_a_step(
-    count: int, by_ms: int, is_step: bool
+    count: int,
+    by_ms: int,
+    is_step: bool,
 ) -> None:
     """The frames have a period of 1 ms and follow a frame at 100 ms."""
     before = list(range(101))

@@ -35,7 +35,17 @@ def dump(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("form", ["csv", "jsonl", "parquet", "candump", "blf", "mf4-log"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        "csv",
+        "jsonl",
+        "parquet",
+        "candump",
+        "blf",
+        "mf4-log",
+    ],
+)
 def test_an_input_without_frames_is_refused_and_leaves_no_file(tmp_path: Path, form: str) -> None:
     source = tmp_path / "other.log"
     is_table = form in ("csv", "jsonl", "parquet")
@@ -56,7 +66,12 @@ def test_an_input_without_frames_is_refused_and_leaves_no_file(tmp_path: Path, f
     ],
 )
 def test_a_missing_library_is_named_with_the_command_that_installs_it(
-    dump: Path, tmp_path: Path, module: str, form: str, needed: str, monkeypatch: pytest.MonkeyPatch
+    dump: Path,
+    tmp_path: Path,
+    module: str,
+    form: str,
+    needed: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     said = refused(1, "convert", dump, tmp_path / "out", "--to", form)
@@ -67,7 +82,9 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "asc", "blf", "mf4-log"])
 def test_a_full_disk_is_reported_in_one_line_and_leaves_no_file(
-    dump: Path, tmp_path: Path, form: str
+    dump: Path,
+    tmp_path: Path,
+    form: str,
 ) -> None:
     def small() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
@@ -86,7 +103,9 @@ def test_a_full_disk_is_reported_in_one_line_and_leaves_no_file(
     [("csv", signal.SIGINT), ("parquet", signal.SIGTERM), ("blf", signal.SIGINT)],
 )
 def test_a_signal_leaves_no_incomplete_file(
-    tmp_path: Path, form: str, number: signal.Signals
+    tmp_path: Path,
+    form: str,
+    number: signal.Signals,
 ) -> None:
     # the log is long enough for the signal to arrive before its end
     source = candump_log(tmp_path / "long.log", 100)

@@ -80,7 +80,11 @@ def test_rubbish_between_lines_loses_no_frame(tmp_path: Path, format_: str, rubb
     ],
 )  # fmt: skip
 def test_frames_before_the_damage_of_a_blf_file_are_read(
-    tmp_path: Path, place: int, bits: bytes, lost: slice, told: str
+    tmp_path: Path,
+    place: int,
+    bits: bytes,
+    lost: slice,
+    told: str,
 ) -> None:
     """python-can alone never ends at an object of size 0, and accepts a frame with a DLC of 16."""
     items = at_wall(some_frames(30))
@@ -131,7 +135,9 @@ def test_no_damage_raises_anything_but_a_user_error(tmp_path: Path, format_: str
     ids=["damaged times are left out", "a clock that was set leaves nothing out"],
 )
 def test_a_time_far_away_is_accepted_if_the_next_time_agrees(
-    tmp_path: Path, moved: dict[int, int], lost: list[int]
+    tmp_path: Path,
+    moved: dict[int, int],
+    lost: list[int],
 ) -> None:
     """``moved`` has the days by which the times of frames are wrong."""
     items = at_wall(some_frames(30))
@@ -188,7 +194,10 @@ def test_a_trc_line_with_an_impossible_time_or_length_is_damaged(tmp_path: Path,
     ("version", "count", "damage"), [("1.0", 2, []), ("1.2", 0, ["its file version is not known"])]
 )
 def test_trc_of_version_1_0_is_read_if_its_header_names_the_version(
-    tmp_path: Path, version: str, count: int, damage: list[str]
+    tmp_path: Path,
+    version: str,
+    count: int,
+    damage: list[str],
 ) -> None:
     path = tmp_path / "log.trc"
     lines = "  1)    1.0  0123  2  00 11\n  2)    2.0  0123  1  RTR\n  3)    3.0  00000124  1  22"

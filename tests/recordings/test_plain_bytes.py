@@ -35,8 +35,8 @@ STREAMS: dict[str, Callable[[random.Random], bytes]] = {
 def assumed_times(found: list[Found]) -> list[int]:
     """Return the times of frames in a file of plain bytes, which has no times.
 
-    A live frame follows each period. An info frame is half a period before the next live frame,
-    but not earlier than the frame before it.
+    There is one live frame in each period. An info frame is placed half a period before the next
+    live frame, but not before the previous frame.
     """
     times: list[int] = []
     lives = 0
@@ -53,7 +53,10 @@ def assumed_times(found: list[Found]) -> list[int]:
 @pytest.mark.parametrize("kind", list(STREAMS))
 @pytest.mark.parametrize("seed", range(6))
 def test_rows_are_exactly_the_frames_found_by_brute_force(
-    tmp_path: Path, kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    kind: str,
+    seed: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With small reads, a read may end anywhere in a frame or in rubbish."""
     source = random.Random(f"{kind} {seed}")
@@ -97,7 +100,9 @@ def _time_of(line: str) -> float:
     ("start", "end"), [("3.3", "9"), ("0", "0"), (None, "7.7"), ("12", None), ("8", "8.001")]
 )
 def test_a_part_of_plain_bytes_has_the_frames_of_the_whole_at_its_times(
-    tmp_path: Path, start: str | None, end: str | None
+    tmp_path: Path,
+    start: str | None,
+    end: str | None,
 ) -> None:
     source = tmp_path / "esc.bin"
     source.write_bytes(dump_bytes(15, faults=True))

@@ -154,7 +154,9 @@ def test_a_pipe_gives_the_table_of_the_file(tmp_path: Path, kind: str) -> None:
     [("csv", signal.SIGINT), ("csv", signal.SIGTERM), ("parquet", signal.SIGINT)],
 )
 def test_a_signal_ends_a_stream_and_keeps_its_rows(
-    tmp_path: Path, form: str, number: signal.Signals
+    tmp_path: Path,
+    form: str,
+    number: signal.Signals,
 ) -> None:
     lines = candump_lines(tmp_path)[:300]
     (part := tmp_path / "part.log").write_bytes(b"".join(lines))
@@ -230,7 +232,9 @@ def test_a_full_disk_keeps_the_rows_of_a_stream(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["convert", "decode", "report"])
 def test_devices_are_refused_and_not_opened(
-    tmp_path: Path, command: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    command: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """One of them may be the port of an ESC."""
     more: dict[str, list[object]] = {

@@ -49,7 +49,9 @@ def test_a_log_has_the_same_unix_times_for_us_and_for_python_can(
     found, damage = read_log(path)
     assert damage == []
     for (time_ns, *rest), (expected_ns, *expected) in zip(
-        found, at_wall(items, WALL_NS), strict=True
+        found,
+        at_wall(items, WALL_NS),
+        strict=True,
     ):
         assert abs(time_ns - expected_ns) < 1000
         assert rest == expected

@@ -26,7 +26,12 @@ def _asc(path: Path, times_ms: tuple[int, ...]) -> Path:
     return path
 
 
-def _mf4(path: Path, times_ms: tuple[int, ...], start_s: float, base_s: float = 0.0) -> Path:
+def _mf4(
+    path: Path,
+    times_ms: tuple[int, ...],
+    start_s: float,
+    base_s: float = 0.0,
+) -> Path:
     """Write an MF4 log with ``start_s`` in its header.
 
     Its times count from ``start_s - base_s``.
@@ -135,7 +140,15 @@ def test_unix_times_in_an_asc_log_are_the_time_of_day(tmp_path: Path) -> None:
     _check(_asc(tmp_path / "unix.asc", times), times, 0)
 
 
-@pytest.mark.parametrize("moved", [[0], [0, 1, 2], [5], [0, 20, 39]])
+@pytest.mark.parametrize(
+    "moved",
+    [
+        [0],
+        [0, 1, 2],
+        [5],
+        [0, 20, 39],
+    ],
+)
 def test_an_unordered_mf4_log_is_read_in_order(tmp_path: Path, moved: list[int]) -> None:
     """``moved`` has the numbers of frames that are stored before earlier frames."""
     times = tuple(range(0, 400, 10))

@@ -44,7 +44,11 @@ class Browser:
         command += [PROGRAM, *OPTIONS.split(), f"--user-data-dir={profile}", "about:blank"]
         quiet = subprocess.DEVNULL
         self._process = subprocess.Popen(
-            command, stdin=quiet, stdout=quiet, stderr=quiet, pass_fds=fds
+            command,
+            stdin=quiet,
+            stdout=quiet,
+            stderr=quiet,
+            pass_fds=fds,
         )
         for fd in fds:
             os.close(fd)
@@ -146,12 +150,21 @@ class Browser:
     def run(self, script: str) -> Any:
         """Return the value of an expression. A promise is awaited."""
         found = self.call(
-            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
+            "Runtime.evaluate",
+            expression=script,
+            awaitPromise=True,
+            returnByValue=True,
         )
         assert "exceptionDetails" not in found, found["exceptionDetails"].get("exception", found)
         return found["result"].get("value")
 
-    def mouse(self, kind: str, x: float, y: float, buttons: int = 0) -> None:
+    def mouse(
+        self,
+        kind: str,
+        x: float,
+        y: float,
+        buttons: int = 0,
+    ) -> None:
         """Send an event of the mouse: ``Moved``, ``Pressed`` or ``Released``."""
         event = {"type": f"mouse{kind}", "x": x, "y": y, "buttons": buttons, "clickCount": 1}
         button = "left" if kind != "Moved" else "none"

@@ -14,9 +14,17 @@ ROWS = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=300)
 STEPS = st.lists(st.integers(1, 5), min_size=300, max_size=300)
 
 
-@given(ROWS, STEPS, st.integers(1, 64), st.lists(st.integers(0, 40), max_size=10))
+@given(
+    ROWS,
+    STEPS,
+    st.integers(1, 64),
+    st.lists(st.integers(0, 40), max_size=10),
+)
 def test_gaps_and_extremes_are_kept_for_any_blocks_of_rows(
-    rows: list[tuple[Number, Number]], steps: list[int], points: int, cuts: list[int]
+    rows: list[tuple[Number, Number]],
+    steps: list[int],
+    points: int,
+    cuts: list[int],
 ) -> None:
     times = list(accumulate(steps[: len(rows) - 1], initial=0))
     decimator = Decimator(2, points)

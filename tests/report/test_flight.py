@@ -59,7 +59,12 @@ def flight(bus: BusLayout, rows: list[Row]) -> Flight:
     return flight_of(bus, rows)
 
 
-def table(bus: BusLayout, rows: list[Row], esc: int, *sources: str) -> pd.DataFrame:
+def table(
+    bus: BusLayout,
+    rows: list[Row],
+    esc: int,
+    *sources: str,
+) -> pd.DataFrame:
     """Return the rows as a table with a column for each source.
 
     The column ``held`` is the time for which a row is valid, 0 before a gap.
@@ -93,7 +98,10 @@ def with_computed(data: pd.DataFrame, source: str) -> pd.DataFrame:
 
 @pytest.mark.parametrize("esc", [0, 1])
 def test_the_numbers_equal_those_computed_by_pandas(
-    bus: BusLayout, rows: list[Row], flight: Flight, esc: int
+    bus: BusLayout,
+    rows: list[Row],
+    flight: Flight,
+    esc: int,
 ) -> None:
     sources = (
         "battery_power",
@@ -164,7 +172,9 @@ def test_errors_and_a_swapped_device_are_events_at_their_times(flight: Flight) -
 
 
 def test_losses_are_gaps_in_lines_and_events(
-    bus: BusLayout, rows: list[Row], flight: Flight
+    bus: BusLayout,
+    rows: list[Row],
+    flight: Flight,
 ) -> None:
     lost = [e for e in flight.events if e.text == "No telemetry"]
     assert {e.esc for e in lost} == {0}

@@ -52,7 +52,10 @@ def flown(names: list[str]) -> Flight:
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     written = {}
-    for name, escs, title in (("one", ["esc1"], "One"), ("two", ["left", "right"], EVIL)):
+    for name, escs, title in (
+        ("one", ["esc1"], "One"),
+        ("two", ["left", "right"], EVIL),
+    ):
         written[name] = folder / f"{name}.html"
         html = render(flown(escs), source=title, provenance={EVIL: EVIL}, wall_ns=S)
         written[name].write_text(html, encoding="utf-8")
@@ -89,9 +92,19 @@ def count(browser: Browser, key: str, colour: str) -> int:
     return found
 
 
-@pytest.mark.parametrize(("name", "look"), [("one", "light"), ("two", "dark"), ("two", "phone")])
+@pytest.mark.parametrize(
+    ("name", "look"),
+    [
+        ("one", "light"),
+        ("two", "dark"),
+        ("two", "phone"),
+    ],
+)
 def test_every_plot_is_drawn_and_the_page_fits(
-    browser: Browser, pages: dict[str, Path], name: str, look: str
+    browser: Browser,
+    pages: dict[str, Path],
+    name: str,
+    look: str,
 ) -> None:
     width, height = (390, 844) if look == "phone" else (1280, 900)
     browser.open(pages[name], width, height, dark=look == "dark", phone=look == "phone")
@@ -121,9 +134,20 @@ LABELS = """((key) => {
 
 
 @pytest.mark.parametrize("phone", [False, True])
-@pytest.mark.parametrize("span", [(0, 60), (0, 0.2), (12, 12.06), (10, 50)])
+@pytest.mark.parametrize(
+    "span",
+    [
+        (0, 60),
+        (0, 0.2),
+        (12, 12.06),
+        (10, 50),
+    ],
+)
 def test_time_labels_are_whole_and_apart(
-    browser: Browser, pages: dict[str, Path], phone: bool, span: tuple[float, float]
+    browser: Browser,
+    pages: dict[str, Path],
+    phone: bool,
+    span: tuple[float, float],
 ) -> None:
     browser.open(pages["one"], 390 if phone else 1280, 844, phone=phone)
     browser.run(f"flight.setRange{span}")
@@ -172,7 +196,12 @@ def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Pa
     """
     browser.open(pages["one"])
     cells = "[...document.querySelectorAll('.u-series:not(:first-child) .u-value')]"
-    for seconds, is_known in ((28.5, True), (30.4, False), (30.9, False), (40, True)):
+    for seconds, is_known in (
+        (28.5, True),
+        (30.4, False),
+        (30.9, False),
+        (40, True),
+    ):
         browser.mouse("Moved", *centre(browser, "battery_voltage", seconds / 60))
         browser.settle()
         shown = browser.run(f"{cells}.map((c) => c.textContent)")

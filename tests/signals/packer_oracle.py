@@ -37,7 +37,13 @@ def bit_places(start: int, length: int, little: bool) -> list[tuple[int, int]]:
     return [(n // 8, 7 - n % 8) for n in range(last, first - 1, -1)]
 
 
-def put(data: bytearray, raw: int, start: int, length: int, little: bool) -> None:
+def put(
+    data: bytearray,
+    raw: int,
+    start: int,
+    length: int,
+    little: bool,
+) -> None:
     """Write a raw value bit by bit, a negative one as two's complement."""
     unsigned = raw % (1 << length)
     for number, (byte, bit) in enumerate(bit_places(start, length, little)):
@@ -45,7 +51,13 @@ def put(data: bytearray, raw: int, start: int, length: int, little: bool) -> Non
             data[byte] |= 1 << bit
 
 
-def get(data: bytes, start: int, length: int, little: bool, signed: bool = False) -> int:
+def get(
+    data: bytes,
+    start: int,
+    length: int,
+    little: bool,
+    signed: bool = False,
+) -> int:
     """Read a raw value bit by bit."""
     raw = 0
     for number, (byte, bit) in enumerate(bit_places(start, length, little)):
@@ -179,7 +191,9 @@ def _max_bec_current(_esc: EscTelemetry, info: InfoData) -> Fraction | None:
 
 
 def _counters(
-    names: str, owner: Callable[[EscTelemetry, GatewayStatus], Any], gateway: bool = False
+    names: str,
+    owner: Callable[[EscTelemetry, GatewayStatus], Any],
+    gateway: bool = False,
 ) -> dict[str, Known]:
     def reader(path: str) -> Reader:
         return lambda esc, of_gateway, _: getattr(owner(esc, of_gateway), path)
@@ -466,7 +480,13 @@ class Sig:
             return raw
         return self.error
 
-    def float_is_right(self, raw: int, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> bool:
+    def float_is_right(
+        self,
+        raw: int,
+        esc: EscTelemetry,
+        gateway: GatewayStatus,
+        now: int,
+    ) -> bool:
         """Return True if the IEEE 754 bits are correct, within the rounding of double and type.
 
         NaN is correct for a value that is not available.
@@ -589,14 +609,25 @@ def pascal(source: str) -> str:
 
 def spelled(rng: random.Random, text: str) -> str:
     """Return a name in a random style: lower case, upper case, with or without underscores."""
-    ways = [text, text.upper(), text.lower(), text.replace("_", ""), f"{text[:2]}_{text[2:]}"]
+    ways = [
+        text,
+        text.upper(),
+        text.lower(),
+        text.replace("_", ""),
+        f"{text[:2]}_{text[2:]}",
+    ]
     return rng.choice(ways)
 
 
 class LayoutMaker:
     """Makes random messages with signals that are bound to random sources of the ESCs."""
 
-    def __init__(self, rng: random.Random, escs: Sequence[EscSettings], fd: bool = True) -> None:
+    def __init__(
+        self,
+        rng: random.Random,
+        escs: Sequence[EscSettings],
+        fd: bool = True,
+    ) -> None:
         self.rng = rng
         self.escs = escs
         self.fd = fd
@@ -647,7 +678,10 @@ class LayoutMaker:
         common |= used
 
     def _position(
-        self, taken: set[tuple[int, int]], width: int, length: int
+        self,
+        taken: set[tuple[int, int]],
+        width: int,
+        length: int,
     ) -> tuple[int, bool] | None:
         rng = self.rng
         for _ in range(12):
@@ -660,7 +694,12 @@ class LayoutMaker:
                 return start, little
         return None
 
-    def _add(self, message: Msg, taken: set[tuple[int, int]], mux: str) -> None:
+    def _add(
+        self,
+        message: Msg,
+        taken: set[tuple[int, int]],
+        mux: str,
+    ) -> None:
         rng = self.rng
         source = rng.choice(list(KNOWN))
         known = KNOWN[source]
@@ -779,7 +818,9 @@ def random_info(rng: random.Random) -> InfoData:
 
 
 def random_escs(
-    rng: random.Random, settings: Sequence[EscSettings], now: int
+    rng: random.Random,
+    settings: Sequence[EscSettings],
+    now: int,
 ) -> tuple[list[EscStream], int]:
     """Return ESCs that received random frames, and the time after that.
 

@@ -45,7 +45,11 @@ State = tuple[Sequence[EscTelemetry], GatewayStatus, int]
 
 
 def check_frame(
-    message: Msg, page: int | None, data: bytes, database: Database, state: State
+    message: Msg,
+    page: int | None,
+    data: bytes,
+    database: Database,
+    state: State,
 ) -> None:
     """Compare one frame with the oracle, and with the values that cantools decodes."""
     escs, gateway, now = state
