@@ -144,7 +144,9 @@ class NativeCore:
 
     def slot(self, esc: int) -> Slot:
         places = self._places[esc]
-        return NativeSlot(self, places.pop(0) if places else None, esc, self._slots.add(esc))
+        place = places.pop(0) if places else None
+        python = self._slots.add(esc)
+        return NativeSlot(self, place, esc, python)
 
     def write_slot(self, place: Place, esc: int, settings: SlotSettings) -> bool:
         """Write the rows of a slot. Return False if the core in C cannot express it."""
@@ -244,9 +246,11 @@ class NativeCore:
 
     def apply(self, esc: int, settings: EscSettings) -> None:
         _check(esc, 0, len(self.escs))
-        self.library.kcg_apply(self.core, esc, c.byref(held_settings(settings)))
+        row = held_settings(settings)
+        self.library.kcg_apply(self.core, esc, c.byref(row))
         self.escs[esc].apply(settings)
-        self.shortest_timeout_ns = min(each.settings.timeout_ns for each in self.escs)
+        timeouts = [each.settings.timeout_ns for each in self.escs]
+        self.shortest_timeout_ns = min(timeouts)
 
     def gateway_changed(self, now: int) -> None:
         self.library.kcg_gateway_changed(self.core, 0, now)

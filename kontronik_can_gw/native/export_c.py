@@ -47,17 +47,19 @@ def exported(
         for name, row in zip(names, tables.messages, strict=True)
     ]
     dbc = _plain(layout.file.rpartition("/")[2])
+    sizes = [ctypes.sizeof(kind) * len(rows) for kind, rows in tables.arrays.values()]
     words = {
         "dbc": dbc,
         "messages": "\n".join(messages),
         "escs": ", ".join(_plain(esc.name) for esc in escs),
-        "tables": sum(ctypes.sizeof(kind) * len(rows) for kind, rows in tables.arrays.values()),
+        "tables": sum(sizes),
         "licence": licence.strip(),
         "mark": MARK,
         "version": __version__,
     }
     folder = FOLDER / "firmware"
-    page = Template((folder / "README.md").read_text(encoding="utf-8")).substitute(words)
+    template = Template((folder / "README.md").read_text(encoding="utf-8"))
+    page = template.substitute(words)
     texts = {
         "core.c": core_c,
         "core.h": core_h,
@@ -67,7 +69,9 @@ def exported(
         EXAMPLE: (folder / EXAMPLE).read_text(encoding="utf-8"),
     }
     line = f"/* {MARK}, version {__version__}; SPDX-License-Identifier: MIT */\n"
-    return {name: line + text for name, text in texts.items()} | {"README.md": page}
+    files = {name: line + text for name, text in texts.items()}
+    files["README.md"] = page
+    return files
 
 
 def _options(layout: Layout, tables: Tables) -> dict[str, int]:

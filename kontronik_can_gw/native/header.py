@@ -18,7 +18,11 @@ class NotInCore(ValueError):
 
 
 class _PollFd(c.Structure):
-    _fields_ = (("fd", c.c_int), ("events", c.c_short), ("revents", c.c_short))
+    _fields_ = (
+        ("fd", c.c_int),
+        ("events", c.c_short),
+        ("revents", c.c_short),
+    )
 
 
 class _Row(c.Structure):
@@ -30,7 +34,9 @@ class _Row(c.Structure):
     def __init__(self, *values: Any, **named: Any) -> None:
         super().__init__()
         names = [field[0] for field in self._fields_]
-        for name, value in (*zip(names, values, strict=False), *named.items()):
+        for name, value in zip(names, values, strict=False):
+            setattr(self, name, value)
+        for name, value in named.items():
             setattr(self, name, value)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -40,9 +46,19 @@ class _Row(c.Structure):
 
 
 _ROWS = {"kcg_piece", "kcg_pair", "kcg_signal", "kcg_message", "kcg_settings", "kcg_slot_row"}
-_TYPES = {f"{name}_t": getattr(c, f"c_{name}") for name in ("int16", "int32", "int64")}
-_TYPES |= {f"{name}_t": getattr(c, f"c_{name}") for name in ("uint8", "uint16", "uint32", "uint64")}
-_TYPES |= {"int": c.c_int, "double": c.c_double, "size_t": c.c_size_t, "pollfd": _PollFd}
+_TYPES: dict[str, Any] = {
+    "int": c.c_int,
+    "int16_t": c.c_int16,
+    "int32_t": c.c_int32,
+    "int64_t": c.c_int64,
+    "uint8_t": c.c_uint8,
+    "uint16_t": c.c_uint16,
+    "uint32_t": c.c_uint32,
+    "uint64_t": c.c_uint64,
+    "double": c.c_double,
+    "size_t": c.c_size_t,
+    "pollfd": _PollFd,
+}
 _FIELD = re.compile(r"(\*?)(\w+)(?:\[(.+)\])?")
 _FILES = ("core.h", "offline.h", "linux.h")
 

@@ -40,7 +40,8 @@ def sources() -> list[Path]:
 
 def source_number() -> int:
     """Return a number of sources, wire.h and options, which an object made of them carries."""
-    found = zlib.crc32(" ".join((*OPTIONS, wire_header())).encode())
+    texts = [*OPTIONS, wire_header()]
+    found = zlib.crc32(" ".join(texts).encode())
     for source in sources():
         found = zlib.crc32(source.read_bytes(), found)
     return found & 0x7FFF_FFFF
@@ -71,7 +72,8 @@ def fault(path: Path) -> str:
 
 def _not_built() -> str:
     try:
-        return " ".join(NOT_BUILT.read_text(encoding="utf-8", errors="replace").split())
+        text = NOT_BUILT.read_text(encoding="utf-8", errors="replace")
+        return " ".join(text.split())
     except OSError:
         return ""
 

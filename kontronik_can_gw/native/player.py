@@ -13,7 +13,7 @@ from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.offline import ROWS, ColumnOf, FrameRoom, Frames, Rows
-from kontronik_can_gw.native.tables import bind, places_of
+from kontronik_can_gw.native.tables import Places, bind, places_of
 from kontronik_can_gw.signals.plan import Layout
 
 _FRAMES = 1 << 12
@@ -70,7 +70,9 @@ class Player(Output):
         for at, number in enumerate(order):
             value, esc = columns[number]
             row = table[at]
-            where = ([], []) if esc is None else places_of(core.escs[esc].protocol)
+            where: Places = ([], [])
+            if esc is not None:
+                where = places_of(core.escs[esc].protocol)
             bind(row.of, value, where, esc)
             row.of.esc = 255 if esc is None else esc
             row.per_unit = value.per_unit
@@ -128,7 +130,8 @@ class Player(Output):
         at = 4 + 16 * state.index
         found = state.index, state.data_at
         state.index += 1
-        state.data_at += int.from_bytes(self._payload[at + 12 : at + 16], "little")
+        length = self._payload[at + 12 : at + 16]
+        state.data_at += int.from_bytes(length, "little")
         return found
 
     def play(self, last_ns: int) -> tuple[bool, int]:

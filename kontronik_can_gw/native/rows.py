@@ -20,7 +20,13 @@ COUNTS = enumeration("KCG_N_BYTES", "KCG_N_")
 """Names of the arguments of kcg_count. From ``link_state`` on they are states and sums."""
 GATEWAY = enumeration("KCG_ESCS_OK")[:-1]
 """Names of the values in kcg.gateway."""
-WIRE_TYPES = {"B": KCG.U8, "b": KCG.I8, "H": KCG.U16, "h": KCG.I16, "I": KCG.U32}
+WIRE_TYPES = {
+    "B": KCG.U8,
+    "b": KCG.I8,
+    "H": KCG.U16,
+    "h": KCG.I16,
+    "I": KCG.U32,
+}
 """Maps the struct code of a wire type to its number in wire.h."""
 _MASK_BITS = 32
 """Number of bits of kcg_signal.negative_states."""
@@ -46,7 +52,8 @@ class Rows:
         return len(self.data) // self._size
 
     def __getitem__(self, place: int) -> Any:
-        return self._kind.from_buffer_copy(self.data, range(len(self))[place] * self._size)
+        number = range(len(self))[place]
+        return self._kind.from_buffer_copy(self.data, number * self._size)
 
     def __iter__(self) -> Iterator[Any]:
         return (self[place] for place in range(len(self)))

@@ -36,7 +36,8 @@ END_OF_TIME = 1 << 61
 _LIMIT = 1 << 63
 _MAX_DIGITS = 15
 """Digits that a factor of a DBC has at most."""
-_SMALLEST, _LARGEST = Fraction(sys.float_info.min), Fraction(sys.float_info.max)
+_SMALLEST = Fraction(sys.float_info.min)
+_LARGEST = Fraction(sys.float_info.max)
 _MAX_POWER = 330
 """A factor that fits is searched within this power of ten."""
 
@@ -58,7 +59,8 @@ def set_scale(row: Any, signal: SignalPlan, value: Value) -> None:
         has_own_code = signal.error != signal.not_available
         if has_own_code and signal.low <= signal.not_available <= signal.high:
             row.flags |= KCG.CODE_AMID
-        row.low, row.high = max(signal.low, -_LIMIT), min(signal.high, _LIMIT - 1)
+        row.low = max(signal.low, -_LIMIT)
+        row.high = min(signal.high, _LIMIT - 1)
     try:
         set_one(row, signal, value)
     except NotInCore as error:
@@ -69,7 +71,11 @@ def set_scale(row: Any, signal: SignalPlan, value: Value) -> None:
 def _reduced(mul: int, add: int, div: int) -> tuple[int, int, int]:
     """Return smaller numbers for the same quotient floor((x * mul + add) / div)."""
     by = math.gcd(mul, add, div)
-    return mul // by, add // by, div // by
+    return (
+        mul // by,
+        add // by,
+        div // by,
+    )
 
 
 def _range(row: Any, value: Value) -> tuple[int, int]:
@@ -89,7 +95,8 @@ def _range(row: Any, value: Value) -> tuple[int, int]:
 
 def _set_integer_scale(row: Any, signal: SignalPlan, value: Value) -> None:
     """Factor and offset of an integer signal. NotInCore if a product leaves 64 bits."""
-    if value.divisor is Divisor.ONE and signal.slope == 1 and signal.intercept == 0:
+    is_identity = signal.slope == 1 and signal.intercept == 0
+    if value.divisor is Divisor.ONE and is_identity:
         row.flags |= KCG.PLAIN
         return
     if signal.numbers is not None:
@@ -132,8 +139,10 @@ def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
     row.low = _bits_of(low)
     row.high = _bits_of(high)
     by, over = _LARGEST_DIVISOR[value.divisor]
-    mul, div = signal.slope.numerator, signal.slope.denominator
-    greatest = max(map(abs, _range(row, value))) * abs(mul) * over
+    mul = signal.slope.numerator
+    div = signal.slope.denominator
+    most = max(map(abs, _range(row, value)))
+    greatest = most * abs(mul) * over
     if signal.numbers is None and max(greatest, div * by) >= _LIMIT // 2:
         raise NotInCore(f"factor {_decimal(signal.factor)} leaves 63 bits")
     if signal.numbers is None:

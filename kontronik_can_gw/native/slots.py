@@ -34,22 +34,35 @@ def reserve(tables: Tables, slots: int) -> list[list[Place]]:
     Return the places of each ESC.
     """
     count = len(tables.listeners_of)
-    used = max(len(tables.signals), len(tables.messages), len(tables.listeners), tables.pages)
-    slots = min(slots, (MAX_ROWS - used) // (MAX_SIGNALS * count))
-    places = [[_add(tables, esc) for _ in range(slots)] for esc in range(count)]
+    used = max(
+        len(tables.signals),
+        len(tables.messages),
+        len(tables.listeners),
+        tables.pages,
+    )
+    room = (MAX_ROWS - used) // (MAX_SIGNALS * count)
+    slots = min(slots, room)
+    places = []
+    for esc in range(count):
+        own_places = [_add(tables, esc) for _ in range(slots)]
+        places.append(own_places)
     for own, listeners in zip(places, tables.listeners_of, strict=True):
         listeners[:0] = [place.message for place in own]
     return places
 
 
 def _add(tables: Tables, esc: int) -> Place:
-    signal, piece = len(tables.signals), len(tables.pieces)
-    place = Place(len(tables.slots), len(tables.messages), signal, piece)
+    place = Place(
+        number=len(tables.slots),
+        message=len(tables.messages),
+        signal=len(tables.signals),
+        piece=len(tables.pieces),
+    )
     tables.messages.append(
         Message(
             words=1,
             pages=1,
-            first_signal=signal,
+            first_signal=place.signal,
             first_page=tables.pages,
             first_word=len(tables.constants),
             first_esc=len(tables.esc_of),
@@ -77,8 +90,11 @@ def slot_rows(plan: SlotPlan, protocol: str) -> Tables:
     """Return the rows of a slot for ESC 0. NotInCore if the core in C cannot express it."""
     if plan.only_python:
         raise NotInCore(plan.only_python)
-    tables = Tables(Layout("", "", (plan.message,)), (EscSettings(protocol=protocol),))
-    if max(len(tables.signals), len(tables.pieces)) > MAX_SIGNALS or tables.pairs:
+    layout = Layout("", "", (plan.message,))
+    settings = EscSettings(protocol=protocol)
+    tables = Tables(layout, (settings,))
+    rows = max(len(tables.signals), len(tables.pieces))
+    if rows > MAX_SIGNALS or tables.pairs:
         raise NotInCore(f"{len(tables.signals)} values")
     return tables
 
@@ -128,7 +144,10 @@ class NativeSlot:
 
     @property
     def sent(self) -> int:
-        return self._python.sent + (self._call("sent") if self._place is not None else 0)
+        sent = self._python.sent
+        if self._place is not None:
+            sent += self._call("sent")
+        return sent
 
     @property
     def is_news(self) -> bool:

@@ -88,7 +88,7 @@ _READ: dict[str, Callable[[NativeEsc], Any]] = {
     "link": lambda esc: LinkState(esc._state.link),
     "layout": lambda esc: esc._state.layout,
     "cells": lambda esc: esc._state.cells,
-    "frame_rate": lambda esc: None if esc._state.rate < 0 else esc._state.rate,
+    "frame_rate": lambda esc: esc._state.rate if esc._state.rate >= 0 else None,
     "live_ns": lambda esc: esc._state.live_ns if esc._state.has_time else None,
     "live_bound_ns": lambda esc: esc._state.live_bound,
     "last_info_ns": lambda esc: esc._state.last_info_ns if esc._state.had_info else None,

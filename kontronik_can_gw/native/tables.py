@@ -40,7 +40,8 @@ from kontronik_can_gw.status import GatewayState
 ALL_ESCS = 255
 MAX_ROWS = 0xFFFF
 """Number of rows of a table whose index has 16 bits."""
-MAX_ALIVE, MAX_BITS = 1 << 16, 64
+MAX_ALIVE = 1 << 16
+MAX_BITS = 64
 _DIVISORS = {
     Divisor.ONE: KCG.BY_ONE,
     Divisor.POLE_PAIRS: KCG.BY_POLES,
@@ -55,8 +56,10 @@ class Tables:
 
     def __init__(self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False) -> None:
         self._plans = layout.messages
-        self.signals, self.messages = Rows(Signal), Rows(Message)
-        self.pieces, self.pairs = Rows(Piece), Rows(Pair)
+        self.signals = Rows(Signal)
+        self.messages = Rows(Message)
+        self.pieces = Rows(Piece)
+        self.pairs = Rows(Pair)
         self.constants: list[int] = []
         self.esc_of: list[int] = []
         self.pages = 0
@@ -72,15 +75,15 @@ class Tables:
         for index, plan in enumerate(layout.messages):
             if plan.length > KCG.DATA or len(plan.pages) > KCG.PAGES:
                 raise NotInCore(f"{plan.name}: {plan.length} bytes, {len(plan.pages)} pages")
-            if max(plan.cycle_ns, plan.delay_ns) >= END_OF_TIME:
-                raise NotInCore(
-                    f"{plan.name}: a cycle or distance of {max(plan.cycle_ns, plan.delay_ns)} ns"
-                )
+            longest = max(plan.cycle_ns, plan.delay_ns)
+            if longest >= END_OF_TIME:
+                raise NotInCore(f"{plan.name}: a cycle or distance of {longest} ns")
             self._add(plan, silent, starts[index])
             for esc in plan.escs:
                 if self.messages[-1].triggers:
                     self.listeners_of[esc].append(index)
-        if max(len(self.signals), self.pages, len(self.listeners)) > MAX_ROWS:
+        most = max(len(self.signals), self.pages, len(self.listeners))
+        if most > MAX_ROWS:
             raise NotInCore(f"{len(self.signals)} signals, {self.pages} pages")
 
     @property
@@ -121,9 +124,14 @@ class Tables:
     @property
     def counts(self) -> dict[str, int]:
         """The numbers of kcg_plan, by name."""
-        words, escs, slots = len(self.constants), len(self.settings), len(self.slots)
-        counts = {"words": words, "messages": len(self.messages) - slots, "escs": escs}
-        return counts | {"pages": self.pages, "slots": slots}
+        slots = len(self.slots)
+        return {
+            "words": len(self.constants),
+            "messages": len(self.messages) - slots,
+            "escs": len(self.settings),
+            "pages": self.pages,
+            "slots": slots,
+        }
 
     def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
         crc = next((s for s in plan.compiled if s.role is Role.CRC), None)
@@ -176,24 +184,32 @@ class Tables:
             width = min(piece.width, 64 - piece.at % 64)
             self.pieces.append(Piece(piece.shift, width, piece.at))
             if width < piece.width:
-                self.pieces.append(
-                    Piece(piece.shift + width, piece.width - width, piece.at + width)
+                rest = Piece(
+                    shift=piece.shift + width,
+                    width=piece.width - width,
+                    at=piece.at + width,
                 )
+                self.pieces.append(rest)
         row = Signal(first_piece=first_piece, pieces=len(self.pieces) - first_piece)
-        row.page = KCG.PAGES if signal.page is None else plan.pages.index(signal.page)
+        row.page = KCG.PAGES
+        if signal.page is not None:
+            row.page = plan.pages.index(signal.page)
         row.esc = ALL_ESCS if signal.esc is None else signal.esc
         row.length = signal.length
-        row.error, row.not_available = signal.error & _M64, signal.not_available & _M64
+        row.error = signal.error & _M64
+        row.not_available = signal.not_available & _M64
         if signal.role is Role.ALIVE:
-            row.kind, row.div = KCG.OF_ALIVE, alive_modulus(signal, has_crc)
+            row.kind = KCG.OF_ALIVE
+            row.div = alive_modulus(signal, has_crc)
             if row.div > MAX_ALIVE:
                 raise NotInCore(
                     f"{plan.name}.{signal.name}: an alive counter of {signal.length} bits"
                 )
         else:
             assert signal.source is not None
+            places = self._wire[signal.esc or 0]
             try:
-                bind(row, signal.source, self._wire[signal.esc or 0], signal.esc)
+                bind(row, signal.source, places, signal.esc)
                 self._scale(row, signal, signal.source)
             except NotInCore as error:
                 raise NotInCore(f"{plan.name}.{signal.name}: {error}") from None
@@ -202,7 +218,8 @@ class Tables:
     def _scale(self, row: Any, signal: SignalPlan, value: Value) -> None:
         flags = row.flags
         if signal.numbers is not None:
-            row.first_pair, row.pairs = len(self.pairs), len(signal.numbers)
+            row.first_pair = len(self.pairs)
+            row.pairs = len(signal.numbers)
             for number, raw in signal.numbers.items():
                 self.pairs.append(Pair(int(number), raw & _M64))
             flags |= KCG.TABLE
@@ -230,11 +247,16 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
         if not value.supplied or esc is None:
             raise NotInCore("not supplied by this ESC's protocol")
         is_info = value.group is Group.INFO or value.last
-        row.kind = KCG.OF_LAST if value.last else KCG.OF_INFO if is_info else KCG.OF_LIVE
+        row.kind = KCG.OF_LIVE
+        if value.last:
+            row.kind = KCG.OF_LAST
+        elif is_info:
+            row.kind = KCG.OF_INFO
         row.place, row.wire = places[is_info][value.words[0]]
         row.not_on = sum(1 << device for device in value.not_on)
         if value.mask != -1:
-            row.shift, row.mask = value.shift, value.mask
+            row.shift = value.shift
+            row.mask = value.mask
         if value.negative_in is not None:
             bind_direction(row, value.negative_in, places[False])
         elif row.kind == KCG.OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
@@ -244,13 +266,16 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
     elif value.name == "uptime":
         row.kind = KCG.OF_UPTIME
     elif value.kind is Kind.GATEWAY and value.name in GATEWAY[:-1]:
-        row.kind, row.place = KCG.OF_GATEWAY, GATEWAY.index(value.name)
+        row.kind = KCG.OF_GATEWAY
+        row.place = GATEWAY.index(value.name)
     elif value.kind in _KINDS:
         row.kind = _KINDS[value.kind]
     elif value.kind is Kind.OBJECT and value.name == "link_status":
-        row.kind, row.place = KCG.OF_STATUS, GatewayState.REPLAY
+        row.kind = KCG.OF_STATUS
+        row.place = GatewayState.REPLAY
     elif name in COUNTS and (value.kind is not Kind.OBJECT or value.name in _NAME_OF):
-        row.kind, row.place = KCG.OF_COUNT, COUNTS.index(name)
+        row.kind = KCG.OF_COUNT
+        row.place = COUNTS.index(name)
     else:
         raise NotInCore(f"no source {value.name}")
 
