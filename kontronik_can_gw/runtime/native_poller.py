@@ -113,10 +113,8 @@ class NativePoller(Poller):
         self.is_over = bool(result.is_over)
         if unsent := turns.unsent():
             can.transmitter.put_refused(unsent, turns.full_since)
-        if result.event >= 0 and turns.has_advanced:  # it ends at its own time, as in a replay
-            self._core.advance_in_python(times.now)
-            gateway.advance(times.now, with_core=False)
-            can.transmit(times.now)
+        if result.event >= 0 and turns.has_advanced:
+            self._finish(can, times.now)
         return self.handlers(turns.ready()) if result.happened else []
 
     def _set_limits(self, period_ns: int, max_turn_ns: int) -> None:
@@ -125,10 +123,17 @@ class NativePoller(Poller):
         request.max_turn = max_turn_ns
         request.max_late = max(MIN_HELD_UP_NS, max_turn_ns)
 
-    def _follow(self) -> bool:
-        """Follow the event that C has come back with, or let time pass for the outputs; False where the rest of the turn is the loop's.
+    def _finish(self, can: "CanLink", now: int) -> None:
+        """Make the rest of a turn at the turn's own time, as a replay does."""
+        self._core.advance_in_python(now)
+        self._gateway.advance(now, with_core=False)
+        can.transmit(now)
 
-        As a rule nothing but frames comes of it, if anything, and C sends them first.
+    def _follow(self) -> bool:
+        """Follow the event that C returned, or let time pass for the outputs.
+
+        Return False if the loop must make the rest of the turn. Usually the outputs make only
+        frames, if anything, and C sends these first.
         """
         gateway, core, turns = self._gateway, self._core, self._turns
         request = turns.request
