@@ -34,7 +34,7 @@ class Sent(Enum):
 
 
 class TransmitQueue:
-    """Frames that wait to be sent.
+    """Frames that wait to be sent. Twin in C: ``put`` and ``hand_over`` of native/linux.c.
 
     1. A frame that is not ``queued`` replaces the waiting frame of its id and page, and keeps that
        frame's place.

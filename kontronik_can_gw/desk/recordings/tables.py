@@ -30,7 +30,10 @@ GROUP = 1 << 16
 
 
 def seconds_text(time_ns: int) -> str:
-    """Return exact decimal seconds: 6 decimals if they are exact, 9 decimals otherwise."""
+    """Return exact decimal seconds: 6 decimals if they are exact, 9 decimals otherwise.
+
+    Twin in C: seconds_text of native/offline.c.
+    """
     seconds, rest = divmod(time_ns, SECOND)
     if rest % 1000:
         return f"{seconds}.{rest:09d}"
@@ -38,7 +41,10 @@ def seconds_text(time_ns: int) -> str:
 
 
 def utc_text(wall_ns: int) -> str:
-    """Return a time as ISO 8601 with microseconds: ``2023-11-14T22:13:20.123456Z``."""
+    """Return a time as ISO 8601 with microseconds: ``2023-11-14T22:13:20.123456Z``.
+
+    Twin in C: utc_text of native/offline.c.
+    """
     second, rest = divmod(wall_ns, SECOND)
     return f"{_second_text(second)}.{rest // 1000:06d}Z"
 

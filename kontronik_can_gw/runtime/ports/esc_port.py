@@ -26,7 +26,9 @@ from kontronik_can_gw.times import MS, NEVER, SECOND
 
 MAX_RETRY_NS = SECOND
 LOOK_NS = 100 * MS
-"""Interval between checks of the ports' settings while the loop runs in Python (LOOK in linux.c).
+"""Interval between checks of the ports' settings while the loop runs in Python.
+
+Twin in C: CHECK_EACH of native/linux.c.
 
 If another program switches echo on, the driver returns the ESC's bytes to it until the next check.
 """
