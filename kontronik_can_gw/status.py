@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 UNCONFIGURED = 0xFF
-"""The node-ID of a node that has none."""
+"""The node-ID of an unconfigured node (CiA 305)."""
 
 
 def name_in_words(name: str) -> str:
@@ -32,7 +32,10 @@ class CanState(IntEnum):
 
 
 class NmtState(IntEnum):
-    """As heartbeats report it. ``INITIALISING`` is also that of a node without a node-ID: LSS only."""
+    """The NMT state in heartbeats (CiA 301).
+
+    A node without a node-ID stays in ``INITIALISING`` and answers only LSS.
+    """
 
     INITIALISING = 0
     STOPPED = 4
@@ -42,7 +45,7 @@ class NmtState(IntEnum):
 
 @dataclass(slots=True)
 class GatewayStatus:
-    """What the gateway knows of itself; the runtime writes the CAN side."""
+    """The gateway's own state and counters. The runtime writes those of the CAN interface."""
 
     state: GatewayState = GatewayState.STARTING
     can_state: CanState = CanState.UNKNOWN
@@ -55,10 +58,10 @@ class GatewayStatus:
     received_frames: int = 0
     bus_off_count: int = 0
     dropped_frames: int = 0
-    """Frames to be sent in order that were lost: too many waited, or the interface was down."""
+    """Frames in a fixed order that were lost: too many waited, or the interface was down."""
     id_conflicts: int = 0
-    """Frames of others with ids that only this gateway may send with."""
+    """Received frames with an id that only this gateway may use."""
 
     def frozen(self) -> "GatewayStatus":
-        """What is known now, as a copy that nobody changes: any thread may read it."""
+        """Return a copy, which other threads may read."""
         return replace(self)

@@ -1,8 +1,10 @@
-"""The messages of a layout: what makes each of them pending, and its frame when it is handed over.
+"""The messages of a layout: when each of them is sent, and with which frame (twin: native/core.c).
 
-Pure: ``on_event`` and time (``advance``) mark messages as pending, ``take`` packs what is pending: newest wins. A message is handed
-over at most once in a step: in the order of the times at which the messages became due, then of their index. Cyclic messages have
-spread phases, and none is sent closer than its minimum distance.
+Events of ESCs (``on_event``) and time (``advance``) mark messages as pending. ``take`` packs the
+pending messages with the values of that moment, so the newest value wins. In one step a message
+is sent at most once. The order is that of the times at which the messages became due, then of
+their index. Messages with the same cycle are spread evenly over it. The minimum distance of a
+message is always kept.
 """
 
 from collections.abc import Sequence
@@ -18,7 +20,7 @@ from kontronik_can_gw.times import NEVER
 
 _LONG_AGO = -(1 << 62)
 _CYCLE, _REQUEST = 1, 2
-"""Why a message is pending: its cycle, sent in any case, or a request, sent where it is news."""
+"""Why a message is pending. It is always sent for its cycle, and for a request if it has news."""
 _MIN_DISTANCE_NS = 1_000_000
 """Minimum distance between frames of a message that are not caused by an event."""
 _EVENT_OF_PACE = {
@@ -30,15 +32,15 @@ _EVENT_OF_PACE = {
 
 
 class Traits:
-    """How a message is sent, by its plan; the tables of the core in C are made of the same."""
+    """How a message is sent according to its plan. The tables of the core in C come from it, too."""
 
     def __init__(self, plan: MessagePlan, silent: bool) -> None:
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         self.is_paged = len(plan.pages) > 1
-        # no cycle, no minimum distance, nothing that follows by itself: the schedule never has to know of it
+        # Without a cycle, a minimum distance and further pages it is never due by time.
         self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
-        # messages with the link's state always go on
+        # Messages with the state of the link are always sent.
         self.silent_able = (
             silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
         )
@@ -55,11 +57,14 @@ class Traits:
                 and not plan.cycle_ns
                 and not (self.by_event and self.triggers & Event.LIVE)
             ):
-                self.triggers |= Event.SECOND  # counters, rates and ages change all the time
+                self.triggers |= Event.SECOND  # counters, rates and ages change constantly
 
 
 def phases(cycles: Sequence[int]) -> list[int]:
-    """A phase for each message within its cycle: messages of one cycle are spaced evenly, and the groups interleave."""
+    """Return the first time of each message within its cycle, in the unit of the cycles.
+
+    Messages with the same cycle are spaced evenly. Groups with different cycles interleave.
+    """
     members: dict[int, list[int]] = {}
     for index, cycle in enumerate(cycles):
         members.setdefault(cycle, []).append(index)
@@ -71,11 +76,7 @@ def phases(cycles: Sequence[int]) -> list[int]:
 
 
 class _Message(Traits):
-    """One message at work.
-
-    ``last`` holds the last frame of each page, with alive counter 0, of a message that is sent on change; ``pages_to_send`` the
-    places of the pages that have to follow without waiting for an event.
-    """
+    """The state of one message."""
 
     def __init__(self, index: int, plan: MessagePlan, silent: bool, first_cycle: int) -> None:
         super().__init__(plan, silent)
@@ -84,8 +85,10 @@ class _Message(Traits):
         self.frame = compile_frame(plan)
         self.place = 0
         self.pages_to_send: set[int] = set()
+        """Places of pages that are sent next, without another event."""
         self.alive = 0
         self.last: dict[int, CanFrame] = {}
+        """If it is sent on change: the last frame of each page, with alive counter 0."""
         self.why = 0
         self._sent_ns = _LONG_AGO
         self._cycle_due = first_cycle if plan.cycle_ns else NEVER
@@ -94,31 +97,38 @@ class _Message(Traits):
 
     @property
     def due(self) -> int:
-        """When ``take_due`` has something to do."""
+        """The time at which ``take_due`` must be called."""
         return min(self._cycle_due, self._deferred_until)
 
     def may_go(self, now: int) -> bool:
-        """True if the minimum distance to its last frame is over."""
+        """Return True if the minimum distance to its last frame is over."""
         return now >= self._sent_ns + self.plan.delay_ns
 
     def defer(self) -> None:
-        """Put it off until its minimum distance is over."""
+        """Delay it until its minimum distance is over."""
         if self._deferred_until == NEVER:
             self._deferred_until = self._sent_ns + self.plan.delay_ns
 
     def sent(self, now: int) -> None:
-        """A frame of it was sent; what was put off is done, but for pages that have to follow."""
-        self._sent_ns, self._cycle_deferred = now, False
+        """Note that a frame of it was sent. Only further pages remain to be sent."""
+        self._sent_ns = now
+        self._cycle_deferred = False
         distance = max(self.plan.delay_ns, _MIN_DISTANCE_NS)
         self._deferred_until = now + distance if self.pages_to_send else NEVER
 
     def take_due(self, now: int) -> tuple[int, int]:
-        """When it became due, and why; a late call skips missed cycles."""
-        when, why = NEVER, 0
-        if (until := self._deferred_until) <= now:
-            when, why = until, _CYCLE | _REQUEST if self._cycle_deferred else _REQUEST
-            self._deferred_until, self._cycle_deferred = NEVER, False
-        if (start := self._cycle_due) <= now:
+        """Return the time at which it became due, and why. A late call skips missed cycles."""
+        when = NEVER
+        why = 0
+        if self._deferred_until <= now:
+            when = self._deferred_until
+            why = _REQUEST
+            if self._cycle_deferred:
+                why |= _CYCLE
+            self._deferred_until = NEVER
+            self._cycle_deferred = False
+        start = self._cycle_due
+        if start <= now:
             cycle = self.plan.cycle_ns
             self._cycle_due += cycle * ((now - start) // cycle + 1)
             if self.may_go(now):
@@ -128,24 +138,30 @@ class _Message(Traits):
         return when, why
 
     def follows(self, events: int, up: bool) -> bool:
-        """Whether these events of an ESC are news to it. ``up``: the ESC's live data is fresh."""
-        if up and self.by_event and self.triggers & Event.LIVE:  # live frames set the pace
-            events &= ~Event.LINK
+        """Return True if the message is sent for these events of an ESC.
+
+        ``up`` is True if the ESC's live data is fresh.
+        """
+        if up and self.by_event and self.triggers & Event.LIVE:
+            events &= ~Event.LINK  # each live frame causes it already
         return bool(self.triggers & events)
 
     def add_all_pages(self) -> None:
-        """Let all pages follow, of a message that has several."""
+        """Send all pages, if there are several."""
         if self.is_paged:
             self.pages_to_send.update(range(len(self.plan.pages)))
 
     def turn_page(self) -> None:
-        """Let the page follow whose turn it is, of a message that has several."""
+        """Send the next page, if there are several."""
         if self.is_paged:
             self.pages_to_send.add(self.place)
             self.place = (self.place + 1) % len(self.plan.pages)
 
     def take_place(self) -> int:
-        """The place of the page to send: the first of those that are to follow, from the one on whose turn it is next."""
+        """Return the place of the page to send, and remove it from those to send.
+
+        It is the first of them, counted from the page whose turn is next.
+        """
         if not self.is_paged:
             return 0
         if not self.pages_to_send:
@@ -157,7 +173,7 @@ class _Message(Traits):
 
 
 def own_ids(layout: Layout) -> dict[int, Owner]:
-    """The ids of the messages (29-bit ones with EXTENDED), and what for."""
+    """Return the ids of the messages (with EXTENDED if they have 29 bits) and their owners."""
     return {
         plan.can_id | (EXTENDED if plan.extended else 0): Owner(None, f"message {plan.name}")
         for plan in layout.messages
@@ -167,7 +183,8 @@ def own_ids(layout: Layout) -> dict[int, Owner]:
 class Messages:
     """All messages of one layout.
 
-    ``silent``: on loss of telemetry messages with values of a lost ESC stop instead of carrying NotAvailable.
+    With ``silent``, messages with values of ESCs stop when the telemetry of all these ESCs is lost.
+    Otherwise they are sent with NotAvailable.
     """
 
     def __init__(
@@ -191,21 +208,21 @@ class Messages:
         ]
         self._timed = [m for m in self._messages if not m.is_free]
         self.pending: dict[int, int] = {}
-        """Messages that ``take`` hands over, and since when."""
+        """Indices of the messages that ``take`` sends, and the times at which they became due."""
         self._stopping = False
 
     @property
     def next_due(self) -> int:
-        """When ``advance`` has something to do; NEVER for never."""
+        """The time at which ``advance`` must be called, or NEVER."""
         return min([message.due for message in self._timed], default=NEVER)
 
     # --- what makes messages pending
 
     def on_event(self, esc: int, events: int, now: int) -> None:
-        """Something of an ESC changed: bits of telemetry.Event."""
+        """Mark the messages that follow these events of an ESC (bits of telemetry.Event)."""
         state = self._escs[esc]
         up = state.live is not None
-        # no further event brings the other pages
+        # After such an event no other one causes the remaining pages.
         is_last = not up or (events & Event.INFO and state.info is None)
         for message in self._of_esc[esc]:
             if message.follows(events, up):
@@ -214,13 +231,19 @@ class Messages:
                 self._request(message, now)
 
     def on_gateway_change(self, now: int, each_second: bool = False) -> None:
-        """The gateway's own state changed; ``each_second``: only its counters, which is news for messages that have no cycle."""
+        """Mark the messages with the gateway's own state, which changed.
+
+        With ``each_second`` only its counters changed, which matters for messages without a cycle.
+        """
         for message in self._of_gateway:
             if not (each_second and message.plan.cycle_ns):
                 self._request(message, now)
 
     def repeat(self, now: int) -> None:
-        """Send every message that has no cycle once, so that nobody goes on with values from before a restart or an outage."""
+        """Send every message without a cycle once.
+
+        Receivers must not keep values from before a restart or an outage.
+        """
         for message in self._messages:
             message.last.clear()
             if not message.plan.cycle_ns:
@@ -228,7 +251,7 @@ class Messages:
                 self._request(message, now)
 
     def stop(self, now: int) -> None:
-        """What the gateway says of itself goes out once more, all pages at once, without regard to minimum distances."""
+        """Send the messages with the gateway's own state at once, all pages, at any distance."""
         self._stopping = True
         for message in self._of_gateway:
             if message.by_event:
@@ -236,14 +259,14 @@ class Messages:
             self._let_go(message, now, _REQUEST)
 
     def advance(self, now: int) -> None:
-        """Let time pass: cycles, and what a minimum distance has put off."""
+        """Mark messages whose cycle or minimum distance is over."""
         for message in self._timed:
             when, why = message.take_due(now)
             if why:
                 self._let_go(message, when, why)
 
     def _request(self, message: _Message, now: int) -> None:
-        """Let a message be handed over as soon as its minimum distance allows."""
+        """Send a message as soon as its minimum distance allows."""
         if message.may_go(now):
             self._let_go(message, now, _REQUEST)
         elif self._is_news(message, now):
@@ -256,12 +279,14 @@ class Messages:
     # --- frames
 
     def take(self, now: int) -> list[CanFrame]:
-        """The frames of what is pending, as they are now."""
-        pending, self.pending = self.pending, {}
+        """Return the frames of the pending messages, with the values of ``now``."""
+        pending = self.pending
+        self.pending = {}
         frames: list[CanFrame] = []
         for _, index in sorted((since, index) for index, since in pending.items()):
             message = self._messages[index]
-            why, message.why = message.why, 0
+            why = message.why
+            message.why = 0
             if self._is_sent(message, why, now):
                 frames.append(self._frame(message, now))
                 while self._stopping and message.pages_to_send:
@@ -269,7 +294,7 @@ class Messages:
         return frames
 
     def _is_sent(self, message: _Message, why: int, now: int) -> bool:
-        """Whether a pending message is sent; one whose cycle is over turns its page."""
+        """Return True if a pending message is sent. If its cycle is over, the next page is due."""
         if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
             message.pages_to_send.clear()
             return False
@@ -279,7 +304,10 @@ class Messages:
         return is_news or bool(why & _CYCLE)
 
     def _is_news(self, message: _Message, now: int) -> bool:
-        """False for a message that is sent on change and has not changed; of several pages those that have follow."""
+        """Return False if a message that is sent on change has not changed.
+
+        Of several pages, those that have changed are sent.
+        """
         if message.by_event or not message.on_change:
             return True
         changed = [
@@ -292,7 +320,7 @@ class Messages:
         return bool(changed or message.pages_to_send)
 
     def _frame(self, message: _Message, now: int) -> CanFrame:
-        """The frame of the page that is next; what it changes is noted."""
+        """Return the frame of the next page, and note that it was sent."""
         place = message.take_place()
         frame = message.frame(self._escs, self._gateway, now, message.alive, place)
         if message.on_change:

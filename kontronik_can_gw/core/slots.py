@@ -1,13 +1,19 @@
-"""Slots of the core: frames that an output sets up, changes and stops while the core runs, as a CANopen node its transmit PDOs.
+"""Slots of the core: frames that an output configures, starts and stops while the core runs.
 
-What makes a slot's frame pending: events of its ESC, its timer (which each frame sent restarts), its owner. It is packed when it is handed
-over, so the newest wins; the inhibit time is the minimum distance between two. A slot with ``watched`` bits is made pending by events that
-change these only. Slots are handed over before the messages of the layout, in the order in which they became due. Slots that became due
-at the same time are ordered by their ``place``.
+For example, each transmit PDO of a CANopen node is a slot (twin: native/core.c).
 
-A paced slot is a measurement at a rate. It goes with the first event after its inhibit time, else by its timer; its distance is the mean of
-both on average. It rests while the first of its signals is not available. A slot with a ``seed`` is a transfer (signals/transfer.py):
-slots of one id number theirs together.
+A slot becomes pending by events of its ESC, by its timer, which every frame restarts, or by its
+owner. It is packed when it is sent, so the newest value wins. The inhibit time is the minimum
+distance between two frames. A slot with ``watched`` bits becomes pending only by events that change
+these bits. Slots are sent before the messages of the layout, in the order in which they became due,
+then in the order of their ``place``.
+
+A paced slot sends a measurement at a rate. It is sent with the first event after its inhibit time,
+or by its timer. The average distance is the mean of both. It pauses while its first signal is not
+available.
+
+A slot with a ``seed`` sends transfers (signals/transfer.py). Slots with the same id share one
+transfer number.
 """
 
 from collections.abc import Sequence
@@ -27,72 +33,75 @@ from kontronik_can_gw.times import NEVER
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlotPlan:
-    """How a slot is filled and what causes it. ESC 0 of the plan is the slot's."""
+    """The values of a slot and the events that cause it. ESC 0 of the plan is the slot's ESC."""
 
     message: MessagePlan
-    """Of up to 64 bits, but for a transfer. Its id and send type do not matter."""
+    """The signals, in up to 64 bits or, for a transfer, 16 bytes. Id and send type are not used."""
     pack: Pack
     triggers: int
-    """The events (of telemetry.Event) that are news to it."""
+    """The events (bits of telemetry.Event) that cause it."""
     watched: int
-    """Bits of which only a change is news; 0: any event of ``triggers`` is."""
+    """If it is not 0, an event causes the slot only if it changes one of these bits."""
     pack_watched: Pack | None
-    """Only what is in ``watched``."""
+    """Packs only the bits of ``watched``."""
     needs_live: bool
     """It is not sent while telemetry is lost."""
     only_python: str = ""
-    """What in it no core in C can know; empty else."""
+    """The part of it that a core in C cannot express, or an empty string."""
     seed: int | None = None
-    """It is a transfer of up to 16 bytes, and what its CRC begins with; None: a frame."""
+    """The initial value of the CRC of a transfer of up to 16 bytes, or None for a frame."""
     paced: bool = False
 
 
 class SlotSettings(NamedTuple):
-    """What a slot sends, and when."""
+    """The frames of a slot, and their times."""
 
     plan: SlotPlan
     can_id: int
-    """11 bits; of a transfer 29."""
+    """11 bits, or 29 bits of a transfer."""
     by_event: bool
-    """Events and the timer make it pending; else only ``Slot.send`` does."""
+    """True if events and the timer cause it, False if only ``Slot.send`` does."""
     inhibit_ns: int
     timer_ns: int
-    """It is sent this long after its last frame at the latest; 0: never for that reason."""
+    """The longest time after its last frame, in ns, or 0 for no timer."""
     fill: int = 0
-    """Bits that the owner fills, besides those of the plan."""
+    """Bits that the owner sets in addition to the signals of the plan."""
     page: int = 0
-    """Of its frame (frames.CanFrame), of a transfer of the first one."""
+    """Page of its frame (frames.CanFrame), or of the first frame of a transfer."""
 
 
 class Slot(Protocol):
-    """A slot, as its owner sees it. At first it is stopped and has no settings."""
+    """The interface of a slot for its owner. At first it is stopped and has no settings."""
 
     @property
     def sent(self) -> int:
-        """Frames so far."""
+        """The number of frames sent."""
 
     @property
     def is_news(self) -> bool:
-        """True if what is in it has changed since its last frame."""
+        """True if its content has changed since its last frame."""
 
     @property
     def is_pending(self) -> bool:
-        """True if a frame is going to be handed over with the next ``take``."""
+        """True if the next ``take`` sends a frame."""
 
     def configure(self, settings: SlotSettings | None, now: int) -> None:
-        """Other settings, or none. A slot that is given some while it is started begins as at its start."""
+        """Change the settings, or remove them.
+
+        A started slot that had no settings begins as in ``start``.
+        """
 
     def start(self, now: int) -> None:
-        """Send from now on, at once for the first time where it is sent by event."""
+        """Send from now on. If events cause the slot, send the first frame at once."""
 
     def stop(self) -> None:
-        """Send nothing any more."""
+        """Stop sending."""
 
     def news(self, now: int) -> None:
-        """What is in it has changed without an event of the ESC."""
+        """Note that its content has changed without an event of the ESC."""
 
     def send(self, now: int) -> None:
-        """Let it be handed over, whatever its inhibit time is."""
+        """Send a frame without regard to the inhibit time."""
 
 
 Place = tuple[int, int]
@@ -100,7 +109,7 @@ Place = tuple[int, int]
 
 
 class PendingSlot(NamedTuple):
-    """A slot that was pending, with the frames to hand over."""
+    """A slot that was pending, with the frames to send."""
 
     since: int
     place: Place
@@ -116,11 +125,12 @@ class PythonSlot:
         self.sent = 0
         self.is_news = False
         self.due = NEVER
-        """When ``advance`` has something to do."""
+        """The time at which ``advance`` must be called."""
         self.triggers = 0
-        """The events that it is to be given."""
-        self.can_id = self.transfer_id = 0
-        """Of the transfers of this id, if it is the first slot of it."""
+        """The events for which ``on_event`` must be called."""
+        self.can_id = 0
+        self.transfer_id = 0
+        """The next transfer number of this id, in the first slot with it."""
         self._owner = owner
         self._esc = esc
         self._escs = (owner.escs[esc],)
@@ -135,7 +145,8 @@ class PythonSlot:
         return self.place in self._owner.pending
 
     def configure(self, settings: SlotSettings | None, now: int) -> None:
-        before, self._settings = self._settings, settings
+        before = self._settings
+        self._settings = settings
         if settings is not None:
             self.can_id = settings.can_id
         if not self._started:
@@ -173,7 +184,8 @@ class PythonSlot:
         self.is_news = True
         if not settings.by_event or self.place in self._owner.pending:
             return
-        if now >= (until := self._last_ns + settings.inhibit_ns):
+        until = self._last_ns + settings.inhibit_ns
+        if now >= until:
             self._deferred_until = NEVER
             self._owner.let_go(self, now)
         elif self._deferred_until == NEVER and not settings.plan.paced:
@@ -185,10 +197,12 @@ class PythonSlot:
             self._owner.let_go(self, now)
 
     def on_event(self, now: int) -> None:
-        """An event of ``triggers`` happened."""
-        if (settings := self._settings) is None or self.place in self._owner.pending:
+        """Handle an event of ``triggers``."""
+        settings = self._settings
+        if settings is None or self.place in self._owner.pending:
             return
-        if self._deferred_until == NEVER and (pack := settings.plan.pack_watched) is not None:
+        pack = settings.plan.pack_watched
+        if pack is not None and self._deferred_until == NEVER:
             watched = pack(self._escs, self._owner.status, now, 0, 0)
             if watched == self._last_watched:
                 return
@@ -196,7 +210,7 @@ class PythonSlot:
         self.news(now)
 
     def advance(self, now: int) -> None:
-        """The timer, or what the inhibit time held back: one of them is due."""
+        """Handle the end of the timer or of the inhibit time."""
         if now >= self._timer_due:
             assert self._settings is not None
             self._restart_timer(self._settings, now)
@@ -205,12 +219,13 @@ class PythonSlot:
         self._set_due()
 
     def frames(self, now: int) -> list[CanFrame]:
-        """What is handed over now; nothing while it needs live data and there is none."""
+        """Return the frames to send now. There are none if it needs live data that is lost."""
         settings, escs = self._settings, self._escs
         assert settings is not None
         plan = settings.plan
         if plan.paced and not self._is_known(plan):
-            self._last_ns, self._timer_due = -NEVER, NEVER
+            self._last_ns = -NEVER
+            self._timer_due = NEVER
             self._set_due()
             return []
         if plan.needs_live and escs[0].live is None:
@@ -227,7 +242,8 @@ class PythonSlot:
         if plan.seed is None:
             return [CanFrame(settings.can_id, data, page=settings.page)]
         first = self._owner.first_of(settings.can_id)
-        number, first.transfer_id = first.transfer_id, first.transfer_id + 1 & TRANSFER_ID
+        number = first.transfer_id
+        first.transfer_id = first.transfer_id + 1 & TRANSFER_ID
         return transfer(settings.can_id, plan.seed, data, number, page=settings.page)
 
     def _is_known(self, plan: SlotPlan) -> bool:
@@ -237,7 +253,11 @@ class PythonSlot:
         return found is not None and divisor(source, esc) is not None
 
     def _moment(self, settings: SlotSettings, now: int) -> int:
-        """When a paced frame that goes now was to go: from there on its pace is kept, unless it was lost."""
+        """Return the planned time of a paced frame that is sent at ``now``.
+
+        The next distance counts from this time, so the rate is kept. If the frame is more than a
+        period too early or too late, the rate starts anew at ``now``.
+        """
         period = (settings.inhibit_ns + settings.timer_ns) // 2
         planned = self._last_ns + period
         return planned if planned - period < now < planned + period else now
@@ -247,7 +267,7 @@ class PythonSlot:
         self._timer_due = now + settings.timer_ns if runs else NEVER
 
     def _rest(self) -> None:
-        """Nothing is due."""
+        """Cancel everything that is due."""
         self.triggers = 0
         self.is_news = False
         self._timer_due = self._deferred_until = NEVER
@@ -268,26 +288,26 @@ class Slots:
         self.escs = escs
         self.status = status
         self.pending: dict[Place, int] = {}
-        """The slots that ``take`` hands over, and the time since when each is pending."""
+        """The slots that ``take`` sends, and the times at which they became due."""
         self.moved: set[int] = set()
-        """ESCs with slots of which ``due`` changed."""
+        """ESCs of slots whose ``due`` changed."""
         self._of: list[list[PythonSlot]] = [[] for _ in escs]
         self._due = [NEVER] * len(escs)
 
     def add(self, esc: int) -> PythonSlot:
-        """Adds a slot of an ESC."""
+        """Add a slot of an ESC."""
         slots = self._of[esc]
         slot = PythonSlot(self, (esc, len(slots)))
         slots.append(slot)
         return slot
 
     def first_of(self, can_id: int) -> PythonSlot:
-        """The slot that numbers the transfers of an id."""
+        """Return the slot that numbers the transfers of an id."""
         return next(slot for slots in self._of for slot in slots if slot.can_id == can_id)
 
     @property
     def triggers(self) -> int:
-        """The events that ``on_event`` is to be given."""
+        """The events for which ``on_event`` must be called."""
         found = Event.NONE
         for slots in self._of:
             for slot in slots:
@@ -295,24 +315,24 @@ class Slots:
         return found
 
     def on_event(self, esc: int, events: int, now: int) -> None:
-        """Something of an ESC changed: bits of telemetry.Event."""
+        """Mark the slots that follow these events of an ESC (bits of telemetry.Event)."""
         for slot in self._of[esc]:
             if events & slot.triggers:
                 slot.on_event(now)
 
     def let_go(self, slot: PythonSlot, now: int) -> None:
-        """Let a slot be handed over."""
+        """Mark a slot as pending."""
         self.pending.setdefault(slot.place, now)
 
     def next_deadline(self) -> int:
-        """When ``advance`` has something to do."""
+        """Return the time at which ``advance`` must be called."""
         while self.moved:
             esc = self.moved.pop()
             self._due[esc] = min([slot.due for slot in self._of[esc]])
         return min(self._due)
 
     def advance(self, now: int) -> None:
-        """Let time pass."""
+        """Mark the slots whose timer or inhibit time is over."""
         if now < self.next_deadline():
             return
         for slots, due in zip(self._of, self._due, strict=True):
@@ -323,21 +343,22 @@ class Slots:
 
     @property
     def is_pending(self) -> bool:
-        """True while ``take`` has something to do."""
+        """True if ``take`` would return frames."""
         return bool(self.pending)
 
     def take(self, now: int) -> list[CanFrame]:
-        """The frames of pending slots, in their order."""
+        """Return the frames of the pending slots, in their order."""
         frames: list[CanFrame] = []
         for slot in self.take_each(now):
             frames += slot.frames
         return frames
 
     def take_each(self, now: int) -> list[PendingSlot]:
-        """The pending slots in their order, each with its frames."""
+        """Return the pending slots in their order, each with its frames."""
         if not self.pending:
             return []
-        pending, self.pending = self.pending, {}
+        pending = self.pending
+        self.pending = {}
         return [
             PendingSlot(since, (esc, number), self._of[esc][number].frames(now))
             for (esc, number), since in sorted(pending.items(), key=itemgetter(1, 0))
