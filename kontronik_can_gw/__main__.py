@@ -3,7 +3,7 @@
 import _signal  # type: ignore[import-not-found]
 import sys
 
-# Ctrl-C ends the program without a word while modules are loaded. (The module signal takes a while to load itself.)
+# Ctrl-C ends the program silently while modules are loaded. The module signal is slow to load.
 if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
     _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 

@@ -1,4 +1,7 @@
-"""Errors that a user can correct, each with its exit code. The command line prints them as plain lines, never as a traceback."""
+"""Errors that a user can correct, each with its exit code.
+
+The command line prints them as plain lines, never as a traceback.
+"""
 
 from collections.abc import Callable, Iterable
 
@@ -6,12 +9,15 @@ from kontronik_can_gw.printable import printable
 
 
 class UserError(Exception):
-    """Wrong usage, configuration or layout (exit code 2). Holds one line per mistake: where, what, remedy."""
+    """Wrong usage, configuration or layout (exit code 2).
+
+    It has one line for each mistake: the place, the mistake and the remedy.
+    """
 
     exit_code = 2
 
     def __init__(self, *problems: str) -> None:
-        self.problems = tuple(printable(problem) for problem in problems)  # they quote files
+        self.problems = tuple(printable(problem) for problem in problems)  # may quote a file
         super().__init__("\n".join(self.problems))
 
 
@@ -30,11 +36,12 @@ def did_you_mean(
     count: int = 1,
     or_known: bool = False,
 ) -> str:
-    """A sentence with the known names nearest to a mistyped one, after a blank.
+    """Return a sentence with the known names nearest to a mistyped one, after a blank.
 
-    Where none is near: empty, or with ``or_known`` a sentence with all of them. ``cutoff``: 0 to 1, how near.
+    If no name is near, the result is empty, or with ``or_known`` a sentence with all names.
+    ``cutoff`` is the least similarity of a near name, from 0 to 1.
     """
-    from difflib import get_close_matches  # not needed where nothing is wrong
+    from difflib import get_close_matches  # only needed after a mistake
 
     names = list(known)
     if near := get_close_matches(name, names, n=count, cutoff=cutoff):

@@ -1,30 +1,30 @@
-"""The CAN frame as the pure core receives it and hands it out, and ids as numbers in sets."""
+"""The CAN frame of the core, and CAN ids as numbers."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
 
 EXTENDED = 0x80000000
-"""Marks a 29-bit id where ids of both lengths are numbers in one set, as SocketCAN does."""
+"""Marks a 29-bit id among ids of both lengths, as SocketCAN does. Such a number is called a key."""
 MAX_EXTENDED_ID = 0x1FFFFFFF
 FIRST_PART, PARTS = 64, 3
 _KEY = 0xFFFFFFFF
 
 
 def id_block(can_id: int, mask: int) -> int:
-    """All 29-bit ids that agree with ``can_id`` in the bits of ``mask``, as one number among keys.
+    """Return a number that stands for all 29-bit ids equal to ``can_id`` in the bits of ``mask``.
 
-    The bits that are free stand above bit 31.
+    Such a block can be in one set with keys: its free bits are above bit 31.
     """
     return (~mask & MAX_EXTENDED_ID) << 32 | EXTENDED | can_id & mask
 
 
 def id_and_mask(key: int) -> tuple[int, int]:
-    """Key (bit 31: 29 bits) and mask of a key or block; all bits of a key count."""
+    """Return id (bit 31 marks 29 bits) and mask of a key or a block. The mask of a key is full."""
     return key & _KEY, _KEY & ~(key >> 32)
 
 
 def block_of(key: int, keys: Iterable[int]) -> int | None:
-    """The first block among ``keys`` that holds a key."""
+    """Return the first block among ``keys`` that contains a key, or None."""
     for each in keys:
         if each > _KEY and not (key ^ each) & _KEY & ~(each >> 32):
             return each
@@ -32,7 +32,7 @@ def block_of(key: int, keys: Iterable[int]) -> int | None:
 
 
 def ids_in_words(key: int) -> str:
-    """A key, or the ids of a block, for people."""
+    """Return a text for the id of a key or the ids of a block."""
     can_id, mask = (each & MAX_EXTENDED_ID for each in id_and_mask(key))
     if mask != MAX_EXTENDED_ID:
         return f"29-bit ids with {can_id:X}h in their bits {mask:X}h"
@@ -40,21 +40,29 @@ def ids_in_words(key: int) -> str:
 
 
 class CanFrame(NamedTuple):
-    """A frame: id (11 or 29 bit), data (0 to 8 bytes, CAN FD to 64).
+    """A CAN frame that was received or is to be sent.
 
-    ``page`` separates frames of one id that do not replace each other (multiplexer pages). ``remote``: a remote frame (RTR), its
-    data only says how much is asked for. ``queued``: it is sent in order and never replaced (answers of SDO, LSS and NMT, EMCY);
-    where False the newest frame of an id is the one that is sent. From page ``FIRST_PART`` on ``PARTS`` pages each are the frames of
-    one transfer, which replace older ones together or not at all.
+    A newer frame replaces a waiting one with the same id and page, unless it is ``queued``.
     """
 
     can_id: int
+    """11 or 29 bits."""
     data: bytes
+    """0 to 8 bytes, or up to 64 with ``fd``."""
     extended: bool = False
+    """True if the id has 29 bits."""
     fd: bool = False
+    """True for a CAN FD frame."""
     page: int = 0
+    """Separates frames of one id that do not replace each other, for example multiplexer pages.
+
+    From page ``FIRST_PART``, each ``PARTS`` pages are the frames of one transfer. They replace
+    older ones together or not at all.
+    """
     remote: bool = False
+    """True for a remote frame (RTR). The length of its data is the requested length."""
     queued: bool = False
+    """True if it is sent in order and never replaced: answers of SDO, LSS and NMT, emergencies."""
 
     @property
     def key(self) -> int:

@@ -1,7 +1,8 @@
 """Import python-can and cantools without the heavy libraries that they pull in.
 
-If asammdf is installed, python-can imports it for MF4 files, and with it numpy and pandas: half a second, 90 MB and threads. The
-top-level package of cantools imports python-can for its tester; its database does not need it.
+If asammdf is installed, python-can imports it for MF4 files, and with it numpy and pandas. That
+takes half a second, 90 MB and threads. The package cantools imports python-can for its tester,
+which its database does not need.
 """
 
 import sys
@@ -14,10 +15,14 @@ from typing import Any
 
 @contextmanager
 def without_asammdf() -> Iterator[None]:
-    """Imports inside this block do not find asammdf unless it is loaded already, and load only the requested part of cantools."""
+    """Import modules in this block without asammdf, and only the requested part of cantools.
+
+    If asammdf is loaded already, it stays available.
+    """
     hide = "asammdf" not in sys.modules
     if hide:
-        sys.modules["asammdf"] = None  # type: ignore[assignment]  # the documented way to make an import fail
+        # This is the documented way to make an import fail.
+        sys.modules["asammdf"] = None  # type: ignore[assignment]
     _prepare_cantools()
     try:
         yield
@@ -32,12 +37,16 @@ def without_asammdf() -> Iterator[None]:
 
 
 class _Package(ModuleType):
-    """A package whose ``__init__`` runs at the first access to an attribute that is missing; its modules can be imported before."""
+    """A package whose ``__init__`` runs at the first access to a missing attribute.
+
+    Its modules can be imported before that.
+    """
 
     def __getattr__(self, name: str) -> Any:
         if self.__spec__ is None or self.__spec__.loader is None:
             raise AttributeError(name)
-        self.__class__ = ModuleType  # type: ignore[assignment]  # an ordinary module from now on
+        # From now on it is an ordinary module.
+        self.__class__ = ModuleType  # type: ignore[assignment]
         self.__spec__.loader.exec_module(self)
         return getattr(self, name)
 

@@ -5,9 +5,10 @@ follow one another on the wire. So byte k of a read (1, 2, ...) arrived no earli
 plus k - 1 byte times. This time is called the bound.
 
 1. Time-outs count from the bound. So no value outlives its time-out, however late it is read.
-2. Ages, energy and run time count from the time of the read, minus the wire time of the bytes after
-   the frame. If that is later than the bound by more than the link's usual interval between frames,
-   they count from the bound, too. So the age shown is at most one interval below the true age.
+2. Ages, energy and run time count from the estimated arrival. It is the time of the read minus the
+   wire time of the bytes after the frame. If this estimate is later than the bound by more than the
+   usual interval between frames, they count from the bound, too. So an age is shown at most one
+   interval too low.
 
 An adapter that bundles bytes delays them further: by 1 ms, or by 16 ms if that cannot be set.
 """
@@ -57,7 +58,9 @@ class EscStream(EscTelemetry):
         self.apply(settings)
         self.base: Counters = self.counters.copy()
         self._arrivals: deque[tuple[int, int]] = deque()
-        """Stream position after each chunk with pending bytes, and the bound of its last byte."""
+        """The reads whose last bytes are not decoded yet: the end of each as a stream position, and
+        the bound of its last byte. The first one tells how old a part of a frame is.
+        """
         self._interval_ns = 0
         """Usual interval between live frames. 0: unknown."""
         self._window_ns = now
@@ -276,6 +279,7 @@ class EscStream(EscTelemetry):
         if not self.up:
             return Event.SECOND
         frames = new.live - old.live
+        # In 0.1 frames per second, rounded.
         self.frame_rate = (20 * SECOND * frames + window_ns) // (2 * window_ns)
         if frames:
             self._interval_ns = window_ns // frames

@@ -32,14 +32,14 @@ _EVENT_OF_PACE = {
 
 
 class Traits:
-    """How a message is sent according to its plan. The tables of the core in C come from it, too."""
+    """How a message is sent, according to its plan. The core in C is given the same."""
 
     def __init__(self, plan: MessagePlan, silent: bool) -> None:
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         self.is_paged = len(plan.pages) > 1
-        # Without a cycle, a minimum distance and further pages it is never due by time.
-        self.is_free = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
+        # Without a cycle, a minimum distance and further pages, time never makes it pending.
+        self.is_untimed = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
         # Messages with the state of the link are always sent.
         self.silent_able = (
             silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
@@ -52,12 +52,10 @@ class Traits:
         if self.by_event or self.on_change:
             for pace in plan.paces:
                 self.triggers |= _EVENT_OF_PACE[pace]
-            if (
-                self.triggers & Event.LINK
-                and not plan.cycle_ns
-                and not (self.by_event and self.triggers & Event.LIVE)
-            ):
-                self.triggers |= Event.SECOND  # counters, rates and ages change constantly
+            by_live_frames = self.by_event and self.triggers & Event.LIVE
+            if self.triggers & Event.LINK and not (plan.cycle_ns or by_live_frames):
+                # Counters, rates and ages change without an event. Nothing else sends the message.
+                self.triggers |= Event.SECOND
 
 
 def phases(cycles: Sequence[int]) -> list[int]:
@@ -71,6 +69,7 @@ def phases(cycles: Sequence[int]) -> list[int]:
     found = [0] * len(cycles)
     for number, (cycle, indices) in enumerate(sorted(members.items())):
         for place, index in enumerate(indices):
+            # place / len(indices) of the cycle, plus number / len(members) of the space between two
             found[index] = cycle * (place * len(members) + number) // (len(indices) * len(members))
     return found
 
@@ -117,7 +116,11 @@ class _Message(Traits):
         self._deferred_until = now + distance if self.pages_to_send else NEVER
 
     def take_due(self, now: int) -> tuple[int, int]:
-        """Return the time at which it became due, and why. A late call skips missed cycles."""
+        """Return the time at which it became due and the reasons, or NEVER and 0.
+
+        A cycle within the minimum distance is returned when the distance is over. A late call skips
+        missed cycles.
+        """
         when = NEVER
         why = 0
         if self._deferred_until <= now:
@@ -206,7 +209,7 @@ class Messages:
         self._of_esc = [
             [m for m in self._messages if esc in m.plan.escs] for esc in range(len(escs))
         ]
-        self._timed = [m for m in self._messages if not m.is_free]
+        self._timed = [m for m in self._messages if not m.is_untimed]
         self.pending: dict[int, int] = {}
         """Indices of the messages that ``take`` sends, and the times at which they became due."""
         self._stopping = False
@@ -222,11 +225,11 @@ class Messages:
         """Mark the messages that follow these events of an ESC (bits of telemetry.Event)."""
         state = self._escs[esc]
         up = state.live is not None
-        # After such an event no other one causes the remaining pages.
-        is_last = not up or (events & Event.INFO and state.info is None)
+        # Live or info data have ended. No later event sends the remaining pages.
+        has_ended = not up or (events & Event.INFO and state.info is None)
         for message in self._of_esc[esc]:
             if message.follows(events, up):
-                if is_last and message.by_event:
+                if has_ended and message.by_event:
                     message.add_all_pages()
                 self._request(message, now)
 
@@ -269,7 +272,7 @@ class Messages:
         """Send a message as soon as its minimum distance allows."""
         if message.may_go(now):
             self._let_go(message, now, _REQUEST)
-        elif self._is_news(message, now):
+        elif self._note_news(message, now):
             message.defer()
 
     def _let_go(self, message: _Message, since: int, why: int) -> None:
@@ -287,26 +290,29 @@ class Messages:
             message = self._messages[index]
             why = message.why
             message.why = 0
-            if self._is_sent(message, why, now):
+            if self._prepare(message, why, now):
                 frames.append(self._frame(message, now))
                 while self._stopping and message.pages_to_send:
                     frames.append(self._frame(message, now))
         return frames
 
-    def _is_sent(self, message: _Message, why: int, now: int) -> bool:
-        """Return True if a pending message is sent. If its cycle is over, the next page is due."""
+    def _prepare(self, message: _Message, why: int, now: int) -> bool:
+        """Return True if a pending message is sent, and choose its pages.
+
+        They are the changed ones if it was requested, and the next one if its cycle is over.
+        """
         if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
             message.pages_to_send.clear()
             return False
-        is_news = bool(why & _REQUEST) and self._is_news(message, now)
+        is_news = bool(why & _REQUEST) and self._note_news(message, now)
         if why & _CYCLE:
             message.turn_page()
         return is_news or bool(why & _CYCLE)
 
-    def _is_news(self, message: _Message, now: int) -> bool:
-        """Return False if a message that is sent on change has not changed.
+    def _note_news(self, message: _Message, now: int) -> bool:
+        """Return False if a message is sent on change and has not changed.
 
-        Of several pages, those that have changed are sent.
+        Changed pages are added to ``pages_to_send``.
         """
         if message.by_event or not message.on_change:
             return True

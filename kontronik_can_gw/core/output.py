@@ -136,7 +136,10 @@ class Output:
         """Let time pass."""
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
-        """Take a frame that arrived from the bus at ``at``. It need not be in ``receive_ids``."""
+        """Take a frame that arrived from the bus at ``at``.
+
+        Every output with ``receive_ids`` gets every received frame, and must check its id.
+        """
 
     def collision(self, esc: int, present: bool, now: int) -> None:
         """Follow another device that begins or stops to send with an id of this ESC's node."""

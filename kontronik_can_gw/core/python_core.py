@@ -44,9 +44,9 @@ class PythonCore:
         self.link_changes: list[int] = []
         self._second_ns = now
         self._next_expiry = 0
-        """No ESC has a deadline before this time.
+        """No ESC has a deadline before this time. 0: not known.
 
-        Deadlines only become later, except when a link comes up. Then this time is computed again.
+        ``expire`` computes it. It is lowered when a link comes up or info data begin.
         """
 
     # --- ESCs

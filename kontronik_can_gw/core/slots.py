@@ -9,8 +9,8 @@ these bits. Slots are sent before the messages of the layout, in the order in wh
 then in the order of their ``place``.
 
 A paced slot sends a measurement at a rate. It is sent with the first event after its inhibit time,
-or by its timer. The average distance is the mean of both. It pauses while its first signal is not
-available.
+or by its timer if there is no event. So the average distance is the mean of inhibit time and timer.
+It pauses while its first signal is not available.
 
 A slot with a ``seed`` sends transfers (signals/transfer.py). Slots with the same id share one
 transfer number.
@@ -189,6 +189,7 @@ class PythonSlot:
             self._deferred_until = NEVER
             self._owner.let_go(self, now)
         elif self._deferred_until == NEVER and not settings.plan.paced:
+            # A paced slot waits for the next event or its timer instead.
             self._deferred_until = until
         self._set_due()
 
@@ -202,6 +203,7 @@ class PythonSlot:
         if settings is None or self.place in self._owner.pending:
             return
         pack = settings.plan.pack_watched
+        # A deferred frame is sent in any case, so nothing is compared then.
         if pack is not None and self._deferred_until == NEVER:
             watched = pack(self._escs, self._owner.status, now, 0, 0)
             if watched == self._last_watched:
@@ -243,7 +245,7 @@ class PythonSlot:
             return [CanFrame(settings.can_id, data, page=settings.page)]
         first = self._owner.first_of(settings.can_id)
         number = first.transfer_id
-        first.transfer_id = first.transfer_id + 1 & TRANSFER_ID
+        first.transfer_id = (number + 1) & TRANSFER_ID
         return transfer(settings.can_id, plan.seed, data, number, page=settings.page)
 
     def _is_known(self, plan: SlotPlan) -> bool:
@@ -260,7 +262,7 @@ class PythonSlot:
         """
         period = (settings.inhibit_ns + settings.timer_ns) // 2
         planned = self._last_ns + period
-        return planned if planned - period < now < planned + period else now
+        return planned if self._last_ns < now < planned + period else now
 
     def _restart_timer(self, settings: SlotSettings, now: int) -> None:
         runs = settings.timer_ns and settings.by_event

@@ -105,7 +105,7 @@ class Value:
     pace: Group | None = None
     """The group whose data changes the value. None: its own group."""
     negative_in: tuple[int, frozenset[int]] | None = None
-    """WIRE: index of a word of the live reading, and its values for which the steps are negative."""
+    """WIRE: index of a word of live data, and its values for which the steps are negative."""
     supplied: bool = True
     """False if the ESC's protocol does not have the value. It is then never available."""
 
@@ -393,7 +393,7 @@ def values_of(protocol: EscProtocol) -> Mapping[str, Value]:
 
 
 def with_direction(protocol: EscProtocol, speed: Value) -> Value:
-    """The speed with a negative sign while the motor turns backward, if the protocol has such states."""
+    """Return the speed. It is negative in the states in which the motor turns backward."""
     state = protocol.by_name.get("operating_state_raw")
     if state is None or not protocol.backward_states or speed.kind is not Kind.WIRE:
         return speed

@@ -1,7 +1,7 @@
 """Frames that wait to be sent.
 
-For each CAN id and multiplexer page the newest frame wins. All ``queued`` frames are sent, in
-order.
+For each CAN id and multiplexer page the newest frame wins. A frame with the flag ``queued``, such
+as an answer of a CANopen node, is never replaced.
 """
 
 from collections.abc import Iterable, Sequence
@@ -12,7 +12,7 @@ from kontronik_can_gw.frames import FIRST_PART, PARTS, CanFrame
 
 QUEUE_LENGTH = 2048
 _place = CanFrame._fields.index
-_slot_of = itemgetter(_place("can_id"), _place("extended"), _place("page"))
+_key_of = itemgetter(_place("can_id"), _place("extended"), _place("page"))
 _is_queued = itemgetter(_place("queued"))
 
 
@@ -37,9 +37,10 @@ class TransmitQueue:
     """Frames that wait to be sent. Twin in C: ``put`` and ``hand_over`` of native/linux.c.
 
     1. A frame that is not ``queued`` replaces the waiting frame of its id and page, and keeps that
-       frame's place.
+       frame's place. If it belongs to a transfer and the older transfer of its id is half sent, it
+       is discarded instead.
     2. Frames of a step are sent in the order of ``put_all``: outputs, then slots, then messages.
-    3. If the interface did not take all of them, queued and other frames alternate until nothing
+    3. If the interface did not take all of them, queued and other frames alternate until no frame
        waits. Neither a flood of answers nor fast measurements can then keep the other kind from the
        bus.
 
@@ -69,7 +70,11 @@ class TransmitQueue:
         return len(self._waiting)
 
     def put_all(self, frames: Sequence[CanFrame]) -> int:
-        """Add frames. Return how many were lost: replaced, or queued beyond ``QUEUE_LENGTH``."""
+        """Add frames. Return how many frames were lost.
+
+        A frame is lost if it is replaced, if an older transfer is half sent, or if it is queued and
+        ``QUEUE_LENGTH`` queued frames wait already.
+        """
         waiting = self._waiting
         count = len(waiting) + len(frames)
         dropped = 0
@@ -79,7 +84,7 @@ class TransmitQueue:
         else:
             if waiting:
                 frames = [frame for frame in frames if not self._has_begun(frame)]
-            waiting.update(zip(map(_slot_of, frames), frames, strict=True))
+            waiting.update(zip(map(_key_of, frames), frames, strict=True))
         lost = count - len(waiting)
         self.dropped += dropped
         self.replaced += lost - dropped
@@ -91,7 +96,7 @@ class TransmitQueue:
         for frame in frames:
             if not frame.queued:
                 if not self._has_begun(frame):
-                    self._waiting[_slot_of(frame)] = frame
+                    self._waiting[_key_of(frame)] = frame
             elif self._queued < QUEUE_LENGTH:
                 self._waiting[(self._next_number,)] = frame
                 self._next_number += 1
@@ -101,15 +106,16 @@ class TransmitQueue:
         return dropped
 
     def _has_begun(self, frame: CanFrame) -> bool:
-        """Return True for a part of a transfer while an older transfer is being sent.
+        """Return True if a frame belongs to a transfer whose predecessor is half sent.
 
-        Then the first frame of the older one was sent, and others wait.
+        The first part of the predecessor is no longer in the queue, but later parts still wait. The
+        parts of a transfer have ``PARTS`` consecutive pages.
         """
-        can_id, _, extended, _, page, _, _ = frame
-        if page < FIRST_PART:
+        if frame.page < FIRST_PART:
             return False
-        first = page - (page - FIRST_PART) % PARTS
-        waiting = [(can_id, extended, first + part) in self._waiting for part in range(PARTS)]
+        first = frame.page - (frame.page - FIRST_PART) % PARTS
+        keys = [(frame.can_id, frame.extended, first + part) for part in range(PARTS)]
+        waiting = [key in self._waiting for key in keys]
         return any(waiting) and not waiting[0]
 
     def in_order(self) -> list[CanFrame]:
@@ -130,7 +136,7 @@ class TransmitQueue:
     def remove(self, frames: Sequence[CanFrame], count: int) -> None:
         """Remove the first ``count`` of ``frames``, which were sent. ``in_order`` returned them.
 
-        The kind of the frame that follows has the next turn.
+        The next turn is that of the other kind than the last frame that was sent.
         """
         if self._queued and count and len(frames) > 1:
             self._queue_has_turn = not frames[count - 1].queued
@@ -145,7 +151,7 @@ class TransmitQueue:
                 del self._waiting[next(numbers)]
                 self._queued -= 1
             else:
-                del self._waiting[_slot_of(frame)]
+                del self._waiting[_key_of(frame)]
 
     def take_all(self) -> list[CanFrame]:
         """Remove and return all waiting frames, in order."""

@@ -341,7 +341,7 @@ int kcg_play_bytes(kcg_offline *o, const uint8_t *data, size_t size, int ended)
     }
 }
 
-/* --- text (twins in desk/recordings: can_logs/writer.py, tables.py) ---------------------------- */
+/* --- text (twins in desk/recordings: can_logs/writer.py, tables.py) --- */
 
 /* The two hex digits of each byte. */
 typedef struct { char of[256][2]; } kcg_pairs;

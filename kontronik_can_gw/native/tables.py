@@ -141,7 +141,7 @@ class Tables:
         flags |= KCG.HAS_CRC * (crc is not None)
         flags |= KCG.SILENT * traits.silent_able
         flags |= KCG.OF_THE_GATEWAY * traits.follows_gateway
-        flags |= KCG.FREE * traits.is_free
+        flags |= KCG.FREE * traits.is_untimed
         first_signal = len(self.signals)
         first_word = len(self.constants)
         words = max(1, -(-plan.length // 8))

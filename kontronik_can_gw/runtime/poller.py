@@ -26,21 +26,26 @@ _IN = select.POLLIN
 
 
 class Poller:
-    """Descriptors that are watched. One that hung up counts as readable, and as writable where that is watched.
+    """Watched descriptors.
 
-    ``now``: when was last asked what is ready, ``before``: the time before that. What was not ready then has come since.
-    ``late``: by how much more than its pause the last turn and the wait took. ``changes`` grows with each change of what is watched.
-    ``is_native``: it is a ``NativePoller``, which has turns. ``is_over``: it has left nothing to do, but for what is ready.
+    A descriptor that hung up counts as readable, and as writable if that is watched.
     """
 
     is_native = False
+    """True for a ``NativePoller``, which makes turns of the loop in C."""
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock
-        self.now = self.before = clock()
+        self.now = clock()
+        """The time of the last look at the descriptors."""
+        self.before = self.now
+        """The time of the look before. Bytes that were not there then have arrived since."""
         self.late = 0
+        """By how many ns the last turn and the wait took longer than planned."""
         self.is_over = False
+        """True if only the handlers of ready descriptors remain to be called in this turn."""
         self.changes = 0
+        """Increases with each change of the watched descriptors."""
         self._poll = select.poll()
         self._epoll = select.epoll()
         self._watched: dict[int, tuple[Handler, int, int | None]] = {}

@@ -43,7 +43,7 @@ class StuckCheck:
         self._has_waited = False
 
     def is_stuck(self, port: WaitingPort | None) -> bool:
-        """Return True if something waited at this call and at the last one, and nothing was read."""
+        """Return True if bytes waited at this call and the last one, and none was read."""
         waits = port is not None and not self._noted.served and port.waits_to_be_read
         is_stuck = waits and self._has_waited
         self._noted.served = False

@@ -90,7 +90,7 @@ class SignalPlan:
     """For an enumeration, raw values by number of the source. Other numbers are sent as Error."""
     constant: int = 0
     saturates: bool = False
-    """A value below ``low`` is sent as ``low``; one above ``high`` as Error, which then is ``high``."""
+    """A value below ``low`` is sent as ``low``, one above ``high`` as Error, which is ``high``."""
     limits: tuple[float, float] = (-math.inf, math.inf)
     """Smallest and greatest raw value of a float. Its codes are bit patterns."""
     page: int | None = None

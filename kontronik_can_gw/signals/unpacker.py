@@ -147,7 +147,7 @@ class SignalReader:
 
 
 _KEPT_VALUES = 2048
-"""Values of a longer signal that are kept, because computing one takes several times as long as finding it."""
+"""Values of a longer signal that are kept. Computing one takes several times as long."""
 _TABLE_BITS = 8
 """Signals of at most this length are decoded with a table of all raw values."""
 

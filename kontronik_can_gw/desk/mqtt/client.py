@@ -118,7 +118,10 @@ class MqttClient:
         client.reconnect_delay_set(MIN_PAUSE_S, longest)  # type: ignore[arg-type]
 
     def _use_tls(self) -> None:
-        """Use the certificates of the configuration. Raises OSError, with the files, if they are unusable."""
+        """Use the certificates of the configuration.
+
+        OSError, with the names of the files, if they cannot be used.
+        """
         config = self._config
         files = (config.ca_file, config.cert_file, config.key_file)
         try:
