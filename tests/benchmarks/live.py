@@ -244,8 +244,9 @@ def memory(context: Context) -> list[Figure]:
     further = (rss["64 ESCs"] - rss["1 ESC"]) / 63
     nodes = (rss["8 ESCs, CANopen"] - rss["1 ESC, CANopen"]) / 7
     aims = {"1 ESC": "<= 24"}
-    return [
-        *(Figure(f"RSS, {name}", mb, "MB", aims.get(name, "")) for name, mb in rss.items()),
-        Figure("RSS, each further ESC", further, "MB", "<= 0.05"),
-        Figure("RSS, each further ESC, CANopen", nodes, "MB"),
-    ]
+    figures = []
+    for name, mb in rss.items():
+        figures.append(Figure(f"RSS, {name}", mb, "MB", aims.get(name, "")))
+    figures.append(Figure("RSS, each further ESC", further, "MB", "<= 0.05"))
+    figures.append(Figure("RSS, each further ESC, CANopen", nodes, "MB"))
+    return figures

@@ -82,16 +82,8 @@ class Context:
             raise LeftOut(f"no gcc to compile {name} with:  sudo apt-get install gcc libc6-dev")
         program = self.folder / source.stem
         if not program.exists() or program.stat().st_mtime < source.stat().st_mtime:
-            command = [
-                gcc,
-                "-O2",
-                "-Wall",
-                "-Wextra",
-                "-o",
-                str(program),
-                str(source),
-                *options,
-            ]
+            flags = ["-O2", "-Wall", "-Wextra", *options]
+            command = [gcc, *flags, "-o", str(program), str(source)]
             subprocess.run(command, check=True)
         return program
 

@@ -38,7 +38,8 @@ class Master:
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         self._bus.setblocking(True)
-        self._bus.send(_FRAME.pack(cob_id, len(data), data.ljust(8, b"\0")))
+        padded = data.ljust(8, b"\0")
+        self._bus.send(_FRAME.pack(cob_id, len(data), padded))
         self._bus.setblocking(False)
 
     def received(self, wait_s: float) -> Iterator[int]:
@@ -80,7 +81,10 @@ def measure(
     sync_hz: float,
 ) -> list[float]:
     """Return the sorted latencies in seconds."""
-    lives = [encode(LiveData(n, 2442 + n % 7, n % 50), Layout.V4) for n in range(100)]
+    lives = []
+    for n in range(100):
+        data = LiveData(electrical_speed=n, battery_voltage=2442 + n % 7, battery_current=n % 50)
+        lives.append(encode(data, Layout.V4))
     start = time.monotonic()
     next_sync = next_live = next_request = start
     latencies: list[float] = []

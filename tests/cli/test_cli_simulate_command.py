@@ -39,10 +39,12 @@ def test_a_file_and_standard_output_get_the_simulators_bytes(tmp_path: Path) -> 
     assert file.read_bytes() == expected
     assert run(*words, "-").data == expected
     assert run(*words, tmp_path / "esc{n}.bin", "--esc", 3, "--layout", "legacy").code == 0
-    files = [(tmp_path / f"esc{n}.bin").read_bytes() for n in (1, 2, 3)]
-    assert len(set(files)) == 3
-    for data in files:
-        assert {frame.layout for frame in frames_of(data)} == {Layout.LEGACY}
+    files = [tmp_path / f"esc{n}.bin" for n in (1, 2, 3)]
+    contents = [path.read_bytes() for path in files]
+    assert len(set(contents)) == 3
+    for data in contents:
+        layouts = {frame.layout for frame in frames_of(data)}
+        assert layouts == {Layout.LEGACY}
 
 
 def test_error_bits_and_the_device_are_as_requested(tmp_path: Path) -> None:

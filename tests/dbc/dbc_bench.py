@@ -64,15 +64,18 @@ def gateway_with(layout: Layout, *lives: LiveData) -> Gateway:
 
     Without data the gateway has one ESC, which has sent nothing.
     """
-    names = [f"esc{number}" for number in range(1, max(1, len(lives)) + 1)]
-    gateway = Gateway([EscSettings(name, 7) for name in names], layout, 0)
+    count = max(1, len(lives))
+    escs = [EscSettings(f"esc{number}", 7) for number in range(1, count + 1)]
+    gateway = Gateway(escs, layout, 0)
     for esc, live in enumerate(lives):
-        gateway.receive_bytes(esc, encode(live, WireLayout.V4), NOW, NOW)
+        wire = encode(live, WireLayout.V4)
+        gateway.receive_bytes(esc, wire, NOW, NOW)
     return gateway
 
 
 def packed(plan: MessagePlan, gateway: Gateway, page: int | None = None) -> bytes:
     """Return the current data of a message."""
     pack = compile_pack(plan)
-    bits = pack(gateway.escs, gateway.status, NOW, 0, plan.pages.index(page))
+    place = plan.pages.index(page)
+    bits = pack(gateway.escs, gateway.status, NOW, 0, place)
     return bits.to_bytes(plan.length, "little")

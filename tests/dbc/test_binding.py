@@ -224,6 +224,7 @@ def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
     assert counters == [n % 15 for n in range(42)]
     for frame in frames:
         # the package needs a byte after the CRC
-        moved = frame.data[at : at + 1] + frame.data[:at] + frame.data[at + 1 :]
+        crc = frame.data[at : at + 1]
+        moved = crc + frame.data[:at] + frame.data[at + 1 :]
         assert theirs(moved, 0, data_id) == moved
         assert p01.e2e_p01_check(bytearray(moved), data_id, offset=0)

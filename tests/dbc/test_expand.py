@@ -67,7 +67,8 @@ def facts(thing: Any, prefix: str = "") -> Any:
         return [facts(each, prefix) for each in thing]
     if hasattr(thing, "definition") or not hasattr(thing, "__dict__"):  # an attribute, a number
         return getattr(thing, "value", thing)
-    return {name: facts(value, prefix) for name, value in vars(thing).items() if name not in MADE}
+    kept = vars(thing).keys() - MADE
+    return {name: facts(value, prefix) for name, value in vars(thing).items() if name in kept}
 
 
 def facts_of_message(message: Message, prefix: str = "") -> Any:
@@ -84,7 +85,8 @@ def facts_of_message(message: Message, prefix: str = "") -> Any:
 def all_facts(database: Database) -> tuple[Any, ...]:
     messages = []
     for message in database.messages:
-        messages.append((message.name, message.frame_id, facts_of_message(message)))
+        content = facts_of_message(message)
+        messages.append((message.name, message.frame_id, content))
     return facts_of_database(database), messages
 
 

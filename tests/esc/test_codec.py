@@ -154,7 +154,8 @@ def test_error_bit_has_the_meaning_of_the_sheet(names: type[ErrorBit], bits: lis
         assert found.remedy.endswith(".")
         assert found.remedy != found.meaning
         assert KONTRONIK.bits[found.text] is found
-    texts = [bit.text for bit in names] + [f"bit{number}" for number in range(len(names), 32)]
+    texts = [bit.text for bit in names]
+    texts += [f"bit{number}" for number in range(len(names), 32)]
     assert bit_texts(0xFFFFFFFF, names) == texts
 
 

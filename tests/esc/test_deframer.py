@@ -194,7 +194,9 @@ def noise_without_kod(size: int) -> bytes:
     return random.Random(18).randbytes(size).replace(b"K", b"J")
 
 
-BAD = sheet.RECORDED_LIVE[:20] + bytes((sheet.RECORDED_LIVE[20] ^ 1,)) + sheet.RECORDED_LIVE[21:]
+_SPOILT = bytearray(sheet.RECORDED_LIVE)
+_SPOILT[20] ^= 1
+BAD = bytes(_SPOILT)
 _BARE = sheet.RECORDED_LIVE[:34]
 LONGER = _BARE + zlib.crc32(_BARE).to_bytes(4, "little")
 DIAGNOSES: list[tuple[str, list[bytes]]] = [

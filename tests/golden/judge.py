@@ -241,7 +241,8 @@ def flags() -> dict[str, tuple[str, int]]:
         ("EscInfo", "selftest_errors", sheet.SELFTEST_BITS),
     ):
         signals = _dbc([]).get_message_by_name(message).signals
-        single = sorted((s for s in signals if s.length == 1), key=lambda s: s.start)
+        single = [signal for signal in signals if signal.length == 1]
+        single.sort(key=lambda signal: signal.start)
         for bit, signal in zip(bits, single, strict=True):
             plain = [re.sub("[^a-z]", "", text).removesuffix("s") for text in bit.words]
             name = signal.name.lower()

@@ -224,7 +224,9 @@ def fits(
     if signal.is_float:
         physical = raw * signal.scale + signal.offset
         return bool(abs(physical - float(value)) <= 1e-6 * abs(value))
-    ideal = float((value - Fraction(str(signal.offset))) / Fraction(str(signal.scale)))
+    offset = Fraction(str(signal.offset))
+    scale = Fraction(str(signal.scale))
+    ideal = float((value - offset) / scale)
     codes = 1 << signal.length
     top = codes // 2 - 1 if signal.is_signed else codes - 1
     fits_into_bits = top - codes < ideal < top + 0.5

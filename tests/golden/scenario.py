@@ -170,7 +170,8 @@ class Player:
         answer.
         """
         index, _, sub = entry.partition(":")
-        multiplexer = int(index, 16).to_bytes(2, "little") + bytes((int(sub, 16),))
+        multiplexer = int(index, 16).to_bytes(2, "little")
+        multiplexer += bytes((int(sub, 16),))
         size = len(data)
         parts: list[bytes] = []
         if verb == "read":

@@ -119,7 +119,8 @@ def numbers(values: Any, texts: Mapping[str, float]) -> Floats:
 
 
 def nanoseconds(seconds: Any) -> Times:
-    found: Times = np.rint(np.asarray(seconds, dtype=np.float64) * 1e9).astype(np.int64)
+    exact = np.asarray(seconds, dtype=np.float64) * 1e9
+    found: Times = np.rint(exact).astype(np.int64)
     return found
 
 
@@ -192,7 +193,8 @@ def check_log(truth: Truth, path: Path) -> Verdict:
             data.append(bytes(message.data))
     verdict = Verdict()
     # a converted log ignores that the clock was set
-    wall = truth.wall_ns(truth.sent_ns[:1])[0] + truth.sent_ns - truth.sent_ns[0]
+    first_wall = truth.wall_ns(truth.sent_ns[:1])[0]
+    wall = first_wall + truth.sent_ns - truth.sent_ns[0]
     # half a microsecond of the log, and half a step of Unix seconds in a float
     slack = 1350 if path.suffix == ".trc" else 750
     verdict.compare("time", nanoseconds(times), wall, slack)
@@ -209,7 +211,10 @@ def decoded(truth: Truth, can_id: int) -> pd.DataFrame:
     rows = np.flatnonzero(truth.sent_ids == can_id)
     message = truth.database.get_message_by_frame_id(can_id)
     payloads, at = np.unique(truth.sent_data[rows], return_inverse=True)
-    found = [message.decode_simple(int(bits).to_bytes(8, "little")) for bits in payloads.tolist()]
+    found = []
+    for bits in payloads.tolist():
+        data = int(bits).to_bytes(8, "little")
+        found.append(message.decode_simple(data))
 
     def number(name: str, value: Any) -> float:
         if str(value) in ("NotAvailable", "Error"):
@@ -221,7 +226,8 @@ def decoded(truth: Truth, can_id: int) -> pd.DataFrame:
     columns = {}
     for signal in found[0]:
         name = value_name(signal)
-        columns[name] = np.array([number(name, values[signal]) for values in found])[at]
+        numbers_of = [number(name, values[signal]) for values in found]
+        columns[name] = np.array(numbers_of)[at]
     times = truth.sent_ns[rows]
     return pd.DataFrame({"ns": times, "sent_ns": times} | columns)
 

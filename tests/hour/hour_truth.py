@@ -54,6 +54,7 @@ GEAR = Fraction(17, 2)
 
 def options_of(length: int) -> EscOptions:
     """Return the options of the ESC, with the faults of a flight of this length in ns."""
+    # every time is a share of the length
     windows = (
         ErrorWindow(OperatingError.UNDERVOLTAGE, length // 5, length // 20),
         ErrorWindow(OperatingError.OPERATING_ERROR_FOUND, length // 5, length // 19),
@@ -189,7 +190,8 @@ class Truth:
     def judged_frames(self) -> judge.Judge:
         """Judge every frame given to the interface by the values of the ESC."""
         found = judge.Judge([_esc()], self.database, [])
-        steps: list[tuple[int, int, Any]] = [(now, 0, given) for now, given in self._inputs]
+        steps: list[tuple[int, int, Any]] = []
+        steps += [(now, 0, given) for now, given in self._inputs]
         steps += [(now, 1, frame) for now, frame in self._sent]
         for now, is_frame, what in sorted(steps, key=lambda step: step[:2]):
             if is_frame:

@@ -74,21 +74,34 @@ def test_values_change_and_keys_work_in_a_terminal(terminal: Terminal, tmp_path:
     names = [f"esc{number}" for number in range(1, 9)]
     frames = flight(layout_of(names), 30, [with_errors(OperatingError.UNDERVOLTAGE)])
     log = write_log(tmp_path / "8.log", frames)
-    escs = [f'[[esc]]\nname = "{one}"\nport = "/dev/tty{one}"\npole_pairs = 7\n' for one in names]
-    toml = written(tmp_path / "8.toml", "[can]\nbitrate = 1000000\n" + "".join(escs))
+    text = "[can]\nbitrate = 1000000\n"
+    for name in names:
+        text += f'[[esc]]\nname = "{name}"\nport = "/dev/tty{name}"\npole_pairs = 7\n'
+    toml = written(tmp_path / "8.toml", text)
     words = ["monitor", str(log), "-c", str(toml), *SLOWLY]
     command = shlex.join([sys.executable, "-m", "kontronik_can_gw", *words])
     terminal.tmux("send-keys", "-l", f"{command}; echo code $?\n")
-    terminal.until(lambda lines: sum(" ok 100 Hz " in line for line in lines) == 8, "a table")
+
+    def is_table(lines: list[str]) -> bool:
+        rows = [line for line in lines if " ok 100 Hz " in line]
+        return len(rows) == 8
+
+    terminal.until(is_table, "a table")
     before = terminal.lines()[3]
     terminal.until(lambda lines: lines[3] != before, "another speed")
-    terminal.type("3", lambda lines: "esc3" in lines[1] and "esc4" not in "".join(lines), "one ESC")
+
+    def is_third_esc(lines: list[str]) -> bool:
+        return "esc3" in lines[1] and "esc4" not in "".join(lines)
+
+    terminal.type("3", is_third_esc, "one ESC")
     terminal.type("n", lambda lines: "esc4" in lines[1], "the next ESC")
     terminal.type("0", lambda lines: lines[1].startswith("ESC"), "all")
     terminal.type("Space", lambda lines: "PAUSED" in lines[0], "a pause")
     terminal.type("q", lambda lines: "code 0" in lines, "the end")
     terminal.tmux("send-keys", "-l", "echo still he''re\n")
-    terminal.until(
-        lambda lines: "still here" in lines and any("echo still" in line for line in lines),
-        "an echo",
-    )
+
+    def is_echo(lines: list[str]) -> bool:
+        typed = [line for line in lines if "echo still" in line]
+        return "still here" in lines and bool(typed)
+
+    terminal.until(is_echo, "an echo")

@@ -52,7 +52,8 @@ class Fault:
             )
         file, match = found[0]
         text = match.string
-        margin = " " * (match.start() - text.rfind("\n", 0, match.start()) - 1)
+        line_start = text.rfind("\n", 0, match.start()) + 1
+        margin = " " * (match.start() - line_start)
         put_in = textwrap.indent(self.replace.strip("\n"), margin).removeprefix(margin)
         changed = text[: match.start()] + put_in + text[match.end() :]
         if file.suffix == ".py":
@@ -138,7 +139,9 @@ def main() -> int:
     )
     parser.add_argument("words", nargs="*", metavar="WORDS")
     words = parser.parse_args().words
-    chosen = [each for each in faults() if not words or any(word in each.what for word in words)]
+    chosen = faults()
+    if words:
+        chosen = [fault for fault in chosen if any(word in fault.what for word in words)]
     wrong = 0
     with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
         copy = Path(folder, "project")

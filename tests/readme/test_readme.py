@@ -26,7 +26,8 @@ from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 
 PROJECT = FOLDER.parents[1]
-PAGES = {path: path.read_text(encoding="utf-8") for path in (*BY_HAND, *FOLDER.glob("*.md"))}
+PATHS = (*BY_HAND, *FOLDER.glob("*.md"))
+PAGES = {path: path.read_text(encoding="utf-8") for path in PATHS}
 README = PAGES[PROJECT / "README.md"]
 ALL = "\n".join(PAGES[path] for path in BY_HAND)
 EXAMPLES = PROJECT / "examples"

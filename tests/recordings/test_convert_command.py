@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import refused
@@ -24,8 +25,9 @@ PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 def program(*words: object, **options: object) -> "subprocess.CompletedProcess[str]":
     """Run ``convert`` in a new process."""
     command = [*PROGRAM, *map(str, words)]
-    options = {"capture_output": True, "text": True, "timeout": 60, **options}
-    return subprocess.run(command, check=False, **options)  # type: ignore[call-overload, no-any-return]
+    every: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 60, **options}
+    done: subprocess.CompletedProcess[str] = subprocess.run(command, check=False, **every)
+    return done
 
 
 @pytest.fixture

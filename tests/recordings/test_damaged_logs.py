@@ -48,7 +48,8 @@ def test_a_cut_file_gives_all_frames_before_the_cut(tmp_path: Path, format_: str
                 found = found[:-1]
         else:
             assert damage
-        assert [item[1:] for item in found] == [item[1:] for item in items[: len(found)]]
+        expected = items[: len(found)]
+        assert [item[1:] for item in found] == [item[1:] for item in expected]
 
 
 @pytest.mark.parametrize("format_", TEXT)

@@ -92,8 +92,8 @@ def test_tables_reports_and_screens_count_error_and_remote_frames(tmp_path: Path
     assert "; 1 error frame left out, which trc does not know" in done.err
     done = run("convert", log, tmp_path / "copy.log")
     assert "left out" not in done.err
-    copied = [line.split()[:3] for line in (tmp_path / "copy.log").read_text().splitlines()]
-    assert copied == [line.split()[:3] for line in lines]
+    copied = (tmp_path / "copy.log").read_text().splitlines()
+    assert [line.split()[:3] for line in copied] == [line.split()[:3] for line in lines]
 
 
 def test_error_and_remote_frames_of_another_channel_are_not_counted(tmp_path: Path) -> None:
@@ -160,7 +160,10 @@ def test_error_frames_of_trc_are_read(tmp_path: Path, head: str, line: str, chan
 def test_error_objects_of_blf_that_python_can_skips_are_read(tmp_path: Path, kind: int) -> None:
     """CAN_ERROR begins with a channel of two bytes, CAN_FD_ERROR_64 with a channel of one byte."""
     path = tmp_path / "log.blf"
-    data = bytes((2, 0, 1, 0, 0, 0, 0, 0)) if kind == 2 else bytes((2, *range(1, 46)))
+    if kind == 2:
+        data = bytes((2, 0, 1, 0, 0, 0, 0, 0))
+    else:
+        data = bytes((2, *range(1, 46)))
     with can.BLFWriter(path, max_container_size=150) as writer:
         for number in range(6):
             now = 1_700_000_000 + number / 100

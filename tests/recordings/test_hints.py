@@ -76,5 +76,6 @@ def test_decode_refuses_files_that_are_not_the_bytes_of_an_esc(tmp_path: Path) -
     said = refused(2, "decode", log)
     assert said.startswith(f"{log}: is a candump recording, not the bytes of an ESC.")
     for command in (["convert"], ["decode", "--csv"]):
-        said = refused(2, command[0], tmp_path / "none", *command[1:], "-o", tmp_path / "o.csv")
-        assert said == f"{tmp_path / 'none'}: there is no such file."
+        missing = tmp_path / "none"
+        said = refused(2, *command, missing, "-o", tmp_path / "o.csv")
+        assert said == f"{missing}: there is no such file."

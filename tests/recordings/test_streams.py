@@ -84,7 +84,9 @@ def test_rows_of_candump_appear_before_the_stream_ends(tmp_path: Path) -> None:
     with started("convert", "-", "-", "--to", "csv") as process:
         send(process, lines[0])
         # with its header the command shows that one line was enough to find the format
-        done = next(n for n in range(1, len(lines)) if b"#" in lines[n] and _ends_row(lines, n))
+        done = 1
+        while not _ends_row(lines, done):
+            done += 1
         send(process, b"".join(lines[1 : done + 1]))
         assert lines_from(process, 2) == expected[:2]
         for begin in range(done + 1, done + 100):
@@ -96,8 +98,9 @@ def test_rows_of_candump_appear_before_the_stream_ends(tmp_path: Path) -> None:
 
 def _ends_row(lines: list[bytes], number: int) -> bool:
     """Return True if the id of this line was in a line before, so that a new row begins."""
-    ids = [line.split()[2].partition(b"#")[0] for line in lines[: number + 1]]
-    return ids[-1] in ids[:-1]
+    frames = [line.split()[2] for line in lines[: number + 1]]
+    *before, last = [frame.partition(b"#")[0] for frame in frames]
+    return last in before
 
 
 def test_rows_of_uart_bytes_appear_one_frame_later(tmp_path: Path) -> None:
@@ -135,7 +138,8 @@ def make_source(tmp_path: Path, kind: str) -> Path:
 @pytest.mark.parametrize("kind", ["capture", "bytes", *FORMATS])
 def test_a_pipe_gives_the_table_of_the_file(tmp_path: Path, kind: str) -> None:
     source = make_source(tmp_path, kind)
-    os.mkfifo(fifo := tmp_path / "fifo")
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
     expected = rows_of(source)
     assert len(expected) > 100
     writer = Thread(target=lambda: fifo.write_bytes(source.read_bytes()))
@@ -159,7 +163,8 @@ def test_a_signal_ends_a_stream_and_keeps_its_rows(
     number: signal.Signals,
 ) -> None:
     lines = candump_lines(tmp_path)[:300]
-    (part := tmp_path / "part.log").write_bytes(b"".join(lines))
+    part = tmp_path / "part.log"
+    part.write_bytes(b"".join(lines))
     expected = rows_of(part)
     target = tmp_path / f"out.{form}"
     with started("convert", "-", target) as process:
@@ -179,7 +184,7 @@ def test_a_signal_ends_a_stream_and_keeps_its_rows(
 
 
 def _is_waiting_with_rows(target: Path) -> bool:
-    """True once the command has written to its file: it has handlers for signals."""
+    """Return True if the command has written to its file, so that it handles signals."""
     part = target.with_name(f"{target.name}.part")
     return part.exists() and part.stat().st_size > 0
 
@@ -236,7 +241,7 @@ def test_devices_are_refused_and_not_opened(
     command: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One of them may be the port of an ESC."""
+    """A device may be the port of an ESC."""
     more: dict[str, list[object]] = {
         "convert": [tmp_path / "o.csv"],
         "decode": [],
@@ -292,16 +297,16 @@ def test_a_page_of_a_pipe_has_the_data_of_the_file(tmp_path: Path, kind: str) ->
         send(process, source.read_bytes())
         assert ended(process)[0] == 0
     assert run("report", source, "-o", tmp_path / "file.html").code == 0
-    page, of_file = (
-        (tmp_path / f"{name}.html").read_text().partition(' id="data">')[2]
-        for name in ("pipe", "file")
-    )
-    assert page == of_file
-    assert "<title>standard input</title>" in (tmp_path / "pipe.html").read_text()
+    of_pipe = (tmp_path / "pipe.html").read_text()
+    of_file = (tmp_path / "file.html").read_text()
+    assert "<title>standard input</title>" in of_pipe
+    _, _, data_of_pipe = of_pipe.partition(' id="data">')
+    _, _, data_of_file = of_file.partition(' id="data">')
+    assert data_of_pipe == data_of_file
 
 
 def test_the_monitor_shows_a_stream_before_it_ends(tmp_path: Path) -> None:
-    """After its frames have stopped, the values expire although the stream has not ended."""
+    """After the last frame the values expire, although the stream has not ended."""
     with started("monitor", "-") as process:
         send(process, b"".join(candump_lines(tmp_path)))
         assert process.stdout is not None
@@ -328,7 +333,7 @@ def test_bytes_of_a_pipe_are_replayed() -> None:
 
 @contextmanager
 def piped() -> Iterator[tuple[Stream, Callable[[bytes], int]]]:
-    """A stream, and a function that writes to its other end."""
+    """Yield a stream, and a function that writes to its other end."""
     reads, writes = os.pipe()
     stream = Stream(reads, "pipe")
     try:
@@ -386,9 +391,11 @@ def test_the_inspected_head_is_read_again() -> None:
 
 
 def test_frames_in_order_are_given_without_the_next_one(tmp_path: Path) -> None:
-    """A clock that steps needs the next frame; no other frame waits for it."""
-    os.mkfifo(fifo := tmp_path / "fifo")
-    write_log(tmp_path / "some.log", "candump", items := some_frames(5))
+    """Only a frame after a step of the clock must wait for the next frame."""
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    items = some_frames(5)
+    write_log(tmp_path / "some.log", "candump", items)
     holder = os.open(fifo, os.O_RDWR)
     os.write(holder, (tmp_path / "some.log").read_bytes())
     with opened(fifo) as log:
@@ -398,9 +405,11 @@ def test_frames_in_order_are_given_without_the_next_one(tmp_path: Path) -> None:
 
 
 def test_one_frame_of_an_esc_is_enough_to_find_the_format(tmp_path: Path) -> None:
-    os.mkfifo(fifo := tmp_path / "fifo")
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
     holder = os.open(fifo, os.O_RDWR)
-    os.write(holder, b"\xff\x00noise" + b"KOD" + dump_bytes().split(b"KOD")[1])
+    _, frame, *_ = dump_bytes().split(b"KOD")
+    os.write(holder, b"\xff\x00noise" + b"KOD" + frame)
     with open_input(fifo) as recording:
         assert recording.provenance["times"].startswith("assumed")
         assert recording.stream is not None

@@ -26,8 +26,9 @@ Row = tuple[int, list[Value]]
 
 def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()) -> Iterator[Row]:
     """Yield the rows of simulated ESCs, whose values pass the real gateway, the bus and the DBC."""
-    count = len(bus.escs)
-    given = [*options, *[EscOptions()] * count][:count]
+    given = list(options)
+    while len(given) < len(bus.escs):
+        given.append(EscOptions())
     reader = SignalReader(bus.layout)
     frames = []
     for now, frame in flight(bus, seconds, given):
@@ -63,12 +64,15 @@ def rows_of(bus: BusLayout, times: Sequence[int], **columns: Sequence[Value]) ->
 
 def data_of(html: str) -> dict[str, Any]:
     """Return the data that a page draws."""
-    packed = html.partition(' id="data">')[2].partition("<")[0]
-    found: dict[str, Any] = json.loads(gzip.decompress(base64.b64decode(packed)))
+    _, _, rest = html.partition(' id="data">')
+    packed, _, _ = rest.partition("<")
+    data = gzip.decompress(base64.b64decode(packed))
+    found: dict[str, Any] = json.loads(data)
     return found
 
 
 def column(bus: BusLayout, source: str, esc: int | None = 0) -> int:
     """Return the position of a source in a row."""
-    columns = [(column.source, column.esc) for column in SignalReader(bus.layout).columns]
-    return columns.index((source, esc))
+    columns = SignalReader(bus.layout).columns
+    sources = [(column.source, column.esc) for column in columns]
+    return sources.index((source, esc))

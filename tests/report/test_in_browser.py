@@ -127,7 +127,8 @@ LABELS = """((key) => {
   const { u } = flight.plots.find((p) => p.key === key), axis = u.axes[0];
   u.ctx.font = axis.font[0];
   return axis._values.map((text, i) => {
-    const at = u.valToPos(axis._splits[i], "x", true), half = u.ctx.measureText(text ?? "").width / 2;
+    const at = u.valToPos(axis._splits[i], "x", true);
+    const half = u.ctx.measureText(text ?? "").width / 2;
     return [text, at - half, at + half, u.ctx.canvas.width];
   }).filter(([text]) => text);
 })"""
@@ -224,7 +225,8 @@ def test_a_drag_zooms_all_plots_and_a_click_on_an_event_jumps_to_it(
     assert browser.run("flight.range()") == pytest.approx([15, 30], abs=0.2)
     scales = browser.run("flight.plots.map((p) => [p.u.scales.x.min, p.u.scales.x.max])")
     assert all(scale == browser.run("flight.range()") for scale in scales)
-    event = "[...document.querySelectorAll('#events tr')].find((r) => /voltage too low/.test(r.textContent))"
+    rows = "[...document.querySelectorAll('#events tr')]"
+    event = f"{rows}.find((r) => /voltage too low/.test(r.textContent))"
     browser.run(f"{event}.click()")
     browser.settle()
     assert browser.run("flight.range()") == pytest.approx([17.5, 23], abs=0.2)

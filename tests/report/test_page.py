@@ -58,7 +58,10 @@ def test_the_page_loads_nothing_and_its_policy_lists_its_scripts(flight: Flight)
         assert tag not in ("link", "img", "iframe", "object", "embed", "base", "form"), tag
         assert not {"src", "href", "style"} & attributes.keys(), (tag, attributes)
         assert not any(name.startswith("on") for name in attributes), (tag, attributes)
-    metas = {a.get("http-equiv"): a.get("content") or "" for t, a in tags.found if t == "meta"}
+    metas = {}
+    for tag, attributes in tags.found:
+        if tag == "meta":
+            metas[attributes.get("http-equiv")] = attributes.get("content") or ""
     policy = metas["Content-Security-Policy"]
     assert policy.startswith("default-src 'none';")
     assert "unsafe" not in policy

@@ -198,8 +198,11 @@ def _counters(
     def reader(path: str) -> Reader:
         return lambda esc, of_gateway, _: getattr(owner(esc, of_gateway), path)
 
-    pairs = [pair.split("=") for pair in names.split()]
-    return {pair[0]: Known("", reader(pair[-1]), rolls=True, gateway=gateway) for pair in pairs}
+    found = {}
+    for pair in names.split():
+        name, _, path = pair.partition("=")
+        found[name] = Known("", reader(path or name), rolls=True, gateway=gateway)
+    return found
 
 
 def _motor_speed(esc: EscTelemetry, live: LiveData) -> Fraction:
@@ -492,7 +495,8 @@ class Sig:
         NaN is correct for a value that is not available.
         """
         kind = "f" if self.length == 32 else "d"
-        sent: float = struct.unpack("<" + kind, raw.to_bytes(self.length // 8, "little"))[0]
+        sent: float
+        (sent,) = struct.unpack(f"<{kind}", raw.to_bytes(self.length // 8, "little"))
         value = self.physical(esc, gateway, now)
         if value is None:
             return math.isnan(sent)

@@ -83,7 +83,9 @@ def check_frame(
 
 
 def same(a: Any, b: Any) -> bool:
-    return bool(a == b) or (isinstance(b, float) and math.isnan(b) and math.isnan(a))
+    if isinstance(b, float) and math.isnan(b):
+        return math.isnan(a)
+    return bool(a == b)
 
 
 def test_ratio_beyond_a_double_is_infinite() -> None:

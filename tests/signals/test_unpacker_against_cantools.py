@@ -193,7 +193,8 @@ def test_columns_of_many_frames_have_the_values_of_each_frame(seed: int) -> None
     for layout in (random_layout, shipped_layout):
         for part in SignalReader(layout).parts:
             length = part.plan.length
-            fills = [rng.randbytes(length) for _ in range(6)] + [bytes(length), b"\xff" * length]
+            fills = [rng.randbytes(length) for _ in range(6)]
+            fills += [bytes(length), b"\xff" * length]
             frames = [int.from_bytes(rng.choice(fills), "little") for _ in range(30)]
             rows = [part.unpacker.values(bits) for bits in frames]
             columns = [part.unpacker.column(at, frames) for at in range(part.count)]
