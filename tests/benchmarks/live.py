@@ -182,7 +182,8 @@ def first_frame_ms(escs: int, config: str) -> float:
         listener.bind("\0" + bus)
         listener.listen(1)
         listener.settimeout(_PATIENCE_S)
-        command = standin(bus, "ours", "run", "-c", write_config(folder, ports, SHIPPED, config))
+        file = write_config(folder, ports, SHIPPED, config)
+        command = standin(bus, "ours", "run", "-c", file)
         log = stack.enter_context((folder / "errors").open("w"))
         begun = time.perf_counter()
         stack.enter_context(started(command, stdin=subprocess.DEVNULL, stderr=log, env=ENVIRONMENT))
@@ -217,7 +218,8 @@ def many_escs_dbc(folder: Path) -> Path:
     Its messages are sent so seldom that a bus could carry them.
     """
     text = SHIPPED.read_text()
-    ids = "|".join(sorted(set(re.findall(r"^BO_ (\d+)", text, re.MULTILINE))))
+    found_ids = set(re.findall(r"^BO_ (\d+)", text, re.MULTILINE))
+    ids = "|".join(sorted(found_ids))
     text = re.sub(rf"\b({ids})\b", lambda found: str(int(found[1]) | _EXTENDED), text)
     text = re.sub(r'(BA_ "GenMsgDelayTime" BO_ \d+) \d+', r"\1 500", text)
     text = re.sub(r'(BA_ "GenMsgCycleTime" BO_ \d+) [1-9]\d*', r"\1 1000", text)

@@ -23,7 +23,7 @@ from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.desk.describe.tables import held
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.signals.plan import SEND_TYPES, Role, SendType
+from kontronik_can_gw.signals.plan import SEND_TYPES, Layout, Role, SendType
 from kontronik_can_gw.signals.units import conversion
 from kontronik_can_gw.times import MS
 
@@ -329,10 +329,16 @@ def test_a_checksum_is_refused_until_the_configuration_defines_it(
         {"bind": {"CHKSM": "crc"} | bind},
     ):
         layout = compiled(text, **said)
-        assert [signal.role for signal in layout.messages[0].signals] == [Role.CRC, Role.ALIVE]
+        assert roles_of(layout) == [Role.CRC, Role.ALIVE]
         assert not layout.warnings[:-1]
     constant = compiled(text, bind=bind | {"CHKSM": 0})
     assert constant.messages[0].signals[0].role is Role.CONSTANT
+
+
+def roles_of(layout: Layout) -> list[Role]:
+    """Return the roles of the signals of the only message."""
+    (message,) = layout.messages
+    return [signal.role for signal in message.signals]
 
 
 def test_names_that_0_5_0_took_for_e2e_profile_1_cause_a_warning() -> None:
@@ -343,7 +349,7 @@ def test_names_that_0_5_0_took_for_e2e_profile_1_cause_a_warning() -> None:
     assert "E2E" not in "".join(compiled(text, e2e_data_ids={"Power": 0x100}).warnings)
     # a counter that is bound counts in the same way as one found by its name
     other = compiled(text.replace("Alive", "MsgNo"), bind={"MsgNo": "alive"})
-    assert [signal.role for signal in other.messages[0].signals] == [Role.CRC, Role.ALIVE]
+    assert roles_of(other) == [Role.CRC, Role.ALIVE]
 
 
 # --- flags without telemetry

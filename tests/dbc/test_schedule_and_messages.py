@@ -280,7 +280,8 @@ def test_scene_sends_these_values_at_these_times(scene: Scene) -> None:
                 bench.gateway.port(0, False, bench.now)
                 bench.take()
     assert list(zip(bench.times(), bench.raws(), strict=True)) == scene.sent
-    assert bench.raws(4, 16) == [number % 16 for number in range(len(scene.sent))]
+    counters = bench.raws(4, 16)
+    assert counters == [number % 16 for number in range(len(scene.sent))]
 
 
 # --- one step
@@ -502,7 +503,9 @@ def test_a_cycle_sends_its_page_in_addition_to_a_changed_page_put_off() -> None:
         bench.until(at * MS)
         bench.live(volts(1)._replace(throttle=throttle))
     bench.until(290 * MS)
-    sent = list(zip(bench.times(), bench.raws(8), bench.raws(16, 8), strict=True))
+    pages = bench.raws(8)
+    values = bench.raws(16, 8)
+    sent = list(zip(bench.times(), pages, values, strict=True))
     assert sent == [
         (0, 1, 0xFFFF),
         (100, 2, 0x8000),
@@ -538,7 +541,12 @@ def test_the_gateway_status_is_sent_when_it_changes(kind: int) -> None:
     data = [tuple(frame.data[:4]) for _, frame in bench.sent]
     if kind == EVENT:  # without a cycle it is sent each second because of its counters
         assert data.pop(3) == data[2]
-    assert data == [(1, 1, 0, 2), (1, 1, 1, 2), (1, 1, 0, 2), (2, 1, 0, 2)]
+    assert data == [
+        (1, 1, 0, 2),
+        (1, 1, 1, 2),
+        (1, 1, 0, 2),
+        (2, 1, 0, 2),
+    ]
     assert bench.times()[2] == 290
 
 
@@ -556,7 +564,10 @@ def test_at_the_stop_every_changed_page_is_sent_despite_the_distance() -> None:
     bench.now = 1150 * MS
     bench.gateway.stop(bench.now)
     bench.take()
-    sent = [(when // MS, frame.data[0], frame.data[1]) for when, frame in bench.sent]
+    sent = []
+    for when, frame in bench.sent:
+        page, value = frame.data[:2]
+        sent.append((when // MS, page, value))
     assert sent[:3] == [(0, 1, 1), (400, 2, 0), (800, 3, 1)]
     assert sorted(sent[3:]) == [(1150, 1, 2), (1150, 2, 4)]
 

@@ -72,7 +72,8 @@ class Tree(Machine):
         *words: str,
         opens: Sequence[str] = (),
     ) -> None:
-        self.file(f"/proc/{pid}/comm", words[0].rpartition("/")[2][:15] + "\n")
+        _, _, program = words[0].rpartition("/")
+        self.file(f"/proc/{pid}/comm", program[:15] + "\n")
         self.file(f"/proc/{pid}/cmdline", "\0".join(words) + "\0")
         self.folder(f"/proc/{pid}/fd")
         for number, name in enumerate(opens, 3):

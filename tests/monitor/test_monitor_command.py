@@ -207,7 +207,8 @@ def test_stream_of_a_bus_leaves_out_missed_seconds() -> None:
             return START_S * SECOND_NS + self.clock
 
     found: list[dict[str, Any]] = []
-    watch.stream(HeldUp("can0", ONE), model.Monitor(ONE), found.append, lambda: len(found) >= 4)
+    source = HeldUp("can0", ONE)
+    watch.stream(source, model.Monitor(ONE), found.append, lambda: len(found) >= 4)
     assert [seconds_of(one) - START_S for one in found] == [1, 2, 3602, 7202]
 
 

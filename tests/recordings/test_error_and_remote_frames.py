@@ -60,7 +60,8 @@ def test_error_and_remote_frames_are_read_back_as_they_were_written(
         assert not writer.left_out
     found = _logged(path)
     assert _kinds(found) == _kinds(expected)
-    assert [item.frame.extended for item in found] == [item.frame.extended for item in expected]
+    for item, wanted in zip(found, expected, strict=True):
+        assert item.frame.extended == wanted.frame.extended
     if format_ in ("candump", "blf", "mf4"):  # ASC does not have the class
         assert [item.frame for item in found] == [item.frame for item in expected]
     with READERS[format_](path) as reader:
@@ -93,7 +94,8 @@ def test_tables_reports_and_screens_count_error_and_remote_frames(tmp_path: Path
     done = run("convert", log, tmp_path / "copy.log")
     assert "left out" not in done.err
     copied = (tmp_path / "copy.log").read_text().splitlines()
-    assert [line.split()[:3] for line in copied] == [line.split()[:3] for line in lines]
+    for copy, line in zip(copied, lines, strict=True):
+        assert copy.split()[:3] == line.split()[:3]
 
 
 def test_error_and_remote_frames_of_another_channel_are_not_counted(tmp_path: Path) -> None:

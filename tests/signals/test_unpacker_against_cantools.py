@@ -124,10 +124,17 @@ def same_frame(one: SignalPlan, other: SignalPlan) -> bool:
 def test_error_code_of_another_signal_does_not_hide_flags() -> None:
     """If the voltage does not fit, the flag for undervoltage matters most."""
     reader = SignalReader(layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout)
-    flag = next(n for n, column in enumerate(reader.columns) if column.name == "Undervoltage")
-    rows = {(254, 254, 0x81): 1, (254, 255, 0x80): 1, (255, 255, 0x80): None, (12, 12, 30): 1}
+    names = [column.name for column in reader.columns]
+    flag = names.index("Undervoltage")
+    rows = {
+        (254, 254, 0x81): 1,
+        (254, 255, 0x80): 1,
+        (255, 255, 0x80): None,
+        (12, 12, 30): 1,
+    }
     for (state, raw, temperature), expected in rows.items():
-        chunks = reader.read(1664, bytes((1, 0, 0, state, raw, temperature, 0, 0)))
+        data = bytes((1, 0, 0, state, raw, temperature, 0, 0))
+        chunks = reader.read(1664, data)
         assert chunks is not None
         ((first, values),) = chunks
         assert values[flag - first] == expected
