@@ -1,8 +1,8 @@
 """Measures how plain the project's English is and how dense its code is.
 
     python tests/prose/plain_english.py                      figures of each group
-    python tests/prose/plain_english.py --hits [PATH ...]    every pattern found, as FILE:LINE: pattern: text
-    python tests/prose/plain_english.py --worst 12           the files with the most patterns per 1000 words
+    python tests/prose/plain_english.py --hits [PATH ...]    every pattern, with file and line
+    python tests/prose/plain_english.py --worst 12           files with most patterns per 1000 words
 
 Three groups are measured: the product (Python and C below `kontronik_can_gw`), the tests (also the
 Debian packaging and the build hook) and the docs (Markdown). Prose is every

@@ -1,4 +1,4 @@
-"""Tables in all formats hold what cantools reads from the same frames, and what a recording's rows are, to the last digit."""
+"""Tables in all formats have the values of a recording's rows, as cantools reads them, exactly."""
 
 import csv
 import json
@@ -43,7 +43,10 @@ from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
 Cells = list[dict[str, Any]]
-"""Of each row the values by signal name, None where not available; Time in seconds, Utc as text to the microsecond."""
+"""The values of each row by signal name. None: not available.
+
+Time is in seconds, Utc is a text with microseconds.
+"""
 
 
 def utc_text(wall_ns: int) -> str:

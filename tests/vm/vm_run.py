@@ -20,16 +20,16 @@ qemu    An emulated machine, in which Python is 15 times slower. It has the same
         each.
 
 In a VM the host's file system is read-only at the same paths, with an empty /tmp, /var/tmp, /run
-and /dev/shm. Each --rw DIR is writable. COMMAND is root, lo is up, the CAN modules are loaded, and no
-vcan interface exists yet. The environment has PATH, HOME, LANG, CI, VIRTUAL_ENV and the variables
+and /dev/shm. Each --rw DIR is writable. COMMAND is root, lo is up, the CAN modules are loaded, and
+no vcan interface exists yet. The environment has PATH, HOME, LANG, CI, VIRTUAL_ENV and the variables
 that begin with KCG_, PYTHON, PYTEST_, HYPOTHESIS_ or COVERAGE_. Python does not find asammdf.
 python-can would import it if it is installed, and numpy and pandas with it, which would take 4 s of
 each process in UML and a minute in QEMU.
 
 Limits of the virtual machines: UML does not save the AVX-512 registers over a signal, so glibc and
 OpenSSL are configured not to use them. Libraries that choose instructions themselves, such as
-numpy, cannot be used. /dev/kvm may exist without working, so QEMU always emulates. SIGKILL leaves UML's
-children behind, so SIGTERM is sent first.
+numpy, cannot be used. /dev/kvm may exist without working, so QEMU always emulates. SIGKILL leaves
+UML's children behind, so SIGTERM is sent first.
 """
 
 import argparse
