@@ -4,6 +4,7 @@ Its output is tested in test_tables.py and in tests/golden/commands/convert.txt.
 """
 
 import io
+import os
 import re
 import resource
 import signal
@@ -109,17 +110,27 @@ def test_a_signal_leaves_no_incomplete_file(
     form: str,
     number: signal.Signals,
 ) -> None:
-    # the log is long enough for the signal to arrive before its end
-    source = candump_log(tmp_path / "long.log", 100)
-    command = [*PROGRAM, str(source), str(tmp_path / "out"), "--to", form]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    while process.poll() is None and not (tmp_path / "out.part").exists():
+    """The disk never finishes writing the file, so the signal always arrives before the end."""
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    source = candump_log(folder / "some.log", 1)
+    slow_disk = "import os, time\nos.fsync = lambda descriptor: time.sleep(600)\n"
+    (tmp_path / "sitecustomize.py").write_text(slow_disk)
+    python_path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    command = [*PROGRAM, str(source), str(folder / "out"), "--to", form]
+    process = subprocess.Popen(
+        command,
+        env=os.environ | {"PYTHONPATH": python_path},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while process.poll() is None and not (folder / "out.part").exists():
         time.sleep(0.001)
     process.send_signal(number)
     said = process.communicate(timeout=60)[1]
     assert process.returncode == 130
     assert said == "kontronik-can-gw convert: stopped: nothing is written\n"
-    assert [path.name for path in tmp_path.iterdir()] == ["long.log"]
+    assert [path.name for path in folder.iterdir()] == ["some.log"]
 
 
 def test_a_long_conversion_shows_its_progress_on_a_terminal(
