@@ -49,7 +49,10 @@ class TransmitQueue:
 
     def __init__(self) -> None:
         self._waiting: dict[tuple[int, ...], CanFrame] = {}
-        """The frames in the order of ``put_all``. The key of a queued frame is a unique number."""
+        """The frames in the order of ``put_all``. The key of a queued frame is a unique number.
+
+        The key of any other frame is its id and page.
+        """
         self._queued = 0
         """Number of queued frames in ``_waiting``."""
         self._next_number = 0
