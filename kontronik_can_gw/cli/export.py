@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.cli.arguments import LAYOUT, option
+from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.desk import bus_layout
 from kontronik_can_gw.cli.output import check_output, configuration_files, output_of, writing
@@ -14,7 +14,10 @@ from kontronik_can_gw.native.export_c import EXAMPLE, exported
 from kontronik_can_gw.native.rows import NotInCore
 
 OPTIONS = (
-    LAYOUT,
+    (
+        option("-c --config FILE", "export the messages of this TOML configuration", type=Path),
+        option("--dbc FILE", "export this DBC instead of the shipped one", type=Path),
+    ),
     option("LANGUAGE", "c: C99", choices=("c",)),
     option("DIR", "folder to write to, which is created", nargs="?"),
     option("-o --output DIR", "another way to give DIR"),
@@ -23,8 +26,9 @@ OPTIONS = (
 EPILOG = """\
 Writes the gateway's core in C (deframer, state of the ESCs, packers, schedule),
 and the tables of the DBC in use as constants. CANopen nodes are not included.
-With -c it exports the messages of that configuration, otherwise the shipped DBC
-for one ESC. README.md in the folder explains how to use the files.
+With -c, or if there is a gateway.toml, it exports the messages of that
+configuration. Otherwise, and with --dbc, it exports the given or the shipped
+DBC for one ESC. README.md in the folder explains how to use the files.
 
 Files that exist, for example of an earlier export, are replaced only with
 --force. example_main.c is never replaced, because you may have changed it.

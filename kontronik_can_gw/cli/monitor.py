@@ -64,7 +64,8 @@ keys: q      quit                         n, p   next, previous ESC
       r      reset minimum and maximum    space  pause (recording)
 
 The monitor marks values beyond its own limits with ! and !!: temperatures of
-power stage and BEC from 80 and 100 degC, cell voltages below 3.5 and 3.3 V.
+power stage and BEC from 80 and 100 degC, cell voltages of 3.5 and 3.3 V and
+below.
 
 If standard output is not a capable terminal, the table is written every second.
 --once waits until each cyclic message of the DBC was received, at most for
