@@ -122,7 +122,7 @@ def choice_of(known: Callable[[], Sequence[str]], span: str = "") -> Kind:
 
 def meanings(known: Sequence[str]) -> Kind:
     """Accept a table that maps each of the user's texts to one of the known texts."""
-    return table_of(choice_of(lambda: known, "meanings"))
+    return table_of(choice_of(lambda: known, "texts"))
 
 
 def table_of(kind: Kind) -> Kind:
@@ -137,7 +137,8 @@ def table_of(kind: Kind) -> Kind:
                 raise ValueError(f"{name}: {error}") from None
         return checked
 
-    return Kind(kind.span, {"type": "object", "additionalProperties": kind.schema}, check)
+    span = f"table of {kind.span}"
+    return Kind(span, {"type": "object", "additionalProperties": kind.schema}, check)
 
 
 def options(path: str, own: frozenset[str]) -> Kind:
@@ -151,7 +152,9 @@ def options(path: str, own: frozenset[str]) -> Kind:
             raise ValueError(f"{value!r} is not a text, a number or a boolean")
         return value
 
-    kind = table_of(Kind("options", {"type": ["string", "number", "boolean"]}, entry))
+    kind = table_of(
+        Kind("texts, numbers or booleans", {"type": ["string", "number", "boolean"]}, entry)
+    )
 
     def check(value: Any) -> Any:
         checked = kind.check(value)
@@ -211,28 +214,34 @@ TEXT = pattern("string", r"[^\x00]*[^\x00\s][^\x00]*", "is not a text")
 _RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
 _RATIO_NUMBER = {"type": "number", "minimum": 0.001, "maximum": 1000}
 _RATIO_TEXT = {"type": "string", "pattern": f"^{_RATIO}$"}
-RATIO = Kind("ratio", {"anyOf": [_RATIO_NUMBER, _RATIO_TEXT]}, _check_ratio)
-NAMES = Kind("names", {"type": "array", "items": TEXT.schema}, _check_names)
-_SOURCES = table_of(Kind("bindings", {"anyOf": [TEXT.schema, {"type": "number"}]}, _check_source))
+RATIO = Kind("0.001 … 1000", {"anyOf": [_RATIO_NUMBER, _RATIO_TEXT]}, _check_ratio)
+NAMES = Kind("list of texts", {"type": "array", "items": TEXT.schema}, _check_names)
+_SOURCES = table_of(
+    Kind("sources or numbers", {"anyOf": [TEXT.schema, {"type": "number"}]}, _check_source)
+)
 _SIGNAL_OR_MESSAGE = {"anyOf": [_SOURCES.schema["additionalProperties"], _SOURCES.schema]}
 BINDINGS = Kind(
-    "bindings", {"type": "object", "additionalProperties": _SIGNAL_OR_MESSAGE}, _check_bindings
+    _SOURCES.span, {"type": "object", "additionalProperties": _SIGNAL_OR_MESSAGE}, _check_bindings
 )
 
 _PORT = "(6553[0-5]|655[0-2][0-9]|65[0-4][0-9]{2}|6[0-4][0-9]{3}|[1-5][0-9]{4}|[1-9][0-9]{0,3})"
 BROKER = pattern(
-    "broker",
+    "host or host:port",
     rf"([A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|\[[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*\])(:{_PORT})?",
     "is not a broker, as broker.example, 192.168.1.5:1883 or [fe80::1]:1883",
     maxLength=200,
 )
 TOPIC = pattern(
-    "topic",
+    "text without + and #",
     r"[^\s\x00+#/$][^\x00-\x1f\x7f+#/]*(/[^\x00-\x1f\x7f+#/]+){0,7}",
     "is not the beginning of topics, as kontronik or fleet/north: no + and #, no / at the ends",
     maxLength=200,
 )
-LEVEL = pattern("level", "[A-Za-z0-9_-]{1,64}", "is not a name of 1 to 64 letters, digits, _ and -")
+LEVEL = pattern(
+    "letters, digits, _ and -",
+    "[A-Za-z0-9_-]{1,64}",
+    "is not a name of 1 to 64 letters, digits, _ and -",
+)
 NODE_NAME = pattern(
     "string",
     r"[a-z0-9_-]+(\.[a-z0-9_-]+)*",
