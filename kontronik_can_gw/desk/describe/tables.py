@@ -243,7 +243,7 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
     for name, value in {**VALUES, **only_objects}.items():
         available = _AVAILABLE[value.group]
         if value.optional:
-            available += ", where supplied"
+            available += ", if known"
         row = {
             "name": name,
             "unit": value.unit,
@@ -258,7 +258,7 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
     protocols = protocols_of(escs)
     operating = [(n, state.text, state) for p in protocols for n, state in p.states.items()]
     return [
-        Table("Values", [_VALUES], rows),
+        Table("Values", _VALUES, rows),
         _errors("Operating errors", "Bits of each live frame.", protocols),
         _errors("Selftest errors", "Bits of the info frame, about once a second.", protocols),
         _states("Operating", operating),
@@ -271,7 +271,19 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
     ]
 
 
-_VALUES = "Bind signals of your own DBC to these values, by name or in [dbc.bind]. Their units may differ."
+_VALUES = (
+    "Bind signals of your own DBC to these values, by name or in [dbc.bind]. Units may differ.",
+    (
+        "Column available: when the value is known. Otherwise its signal is sent as not available. "
+        '"If known" marks a value that can be missing even then, for example because the device '
+        "does not supply it (see Devices), or because nothing has been received yet."
+    ),
+    (
+        "Column counter: yes if the value restarts at 0 after the maximum of its signal or object. "
+        "Column objects: the CANopen objects that show the value. Column only objects: yes if the "
+        "value exists for objects only, so no signal can be bound to it."
+    ),
+)
 
 
 def place(index: int, sub: int) -> str:
