@@ -16,6 +16,7 @@ from eds_text import dcfchk, with_key
 from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.eds import Eds, Entry
+from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import EscConfig
 from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, Row, rows
 
@@ -89,6 +90,9 @@ def test_fields_are_in_wire_order_and_have_their_types(
         assert entry.low is None
         assert entry.high is None
         assert entry.default == 0
+        shown = BINDINGS[index, sub]
+        assert shown.source.name.removesuffix("_raw") == name
+        assert shown.steps == row.per_unit, name
 
 
 def test_unit_codes_agree_with_the_table_of_fields(entries: dict[tuple[int, int], Entry]) -> None:
