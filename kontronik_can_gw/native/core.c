@@ -6,6 +6,8 @@
 #define INFO_TIMEOUT (10 * SECOND)
 #define MIN_DISTANCE INT64_C(1000000)
 #define LONG_AGO (-(INT64_C(1) << 61))
+/* Does not compile if the condition is 0. The name is in the compiler's message. */
+#define ASSERT_AT_COMPILE_TIME(name, condition) typedef char name[(condition) ? 1 : -1]
 
 /* kcg_sending.why. */
 enum {
@@ -290,6 +292,9 @@ static inline int64_t kcg_field(const uint8_t *body, int offset, int type)
     case KCG_I8: return (int8_t)p[0];
     case KCG_U16: return (uint16_t)(p[0] | p[1] << 8);
     case KCG_I16: return (int16_t)(p[0] | p[1] << 8);
+/* A type without a case in kcg_field would be read as KCG_U32. */
+ASSERT_AT_COMPILE_TIME(kcg_field_has_a_case_for_each_type, KCG_WIRE_TYPES == 5);
+
     default: return u32(p);
     }
 }
@@ -299,6 +304,7 @@ uint64_t kcg_count(const kcg_esc *e, int what)
     const uint64_t *n = e->count;
     switch (what) {
     case KCG_N_LIVE_FRAMES: return n[KCG_N_LIVE_V4] + n[KCG_N_LIVE_LEGACY];
+    case KCG_U32:
     case KCG_N_INFO_FRAMES: return n[KCG_N_INFO_V4] + n[KCG_N_INFO_LEGACY];
     case KCG_N_DROPPED_BYTES:
         return n[KCG_N_DROPPED_NOISE] + n[KCG_N_DROPPED_CRC] + n[KCG_N_DROPPED_UNKNOWN_KIND] +

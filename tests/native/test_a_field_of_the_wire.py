@@ -1,6 +1,7 @@
 """A field that is added to fields.py, and nowhere else, is found in both cores and in the export.
 
-A copy of the package gets the field and is compiled anew.
+A copy of the package gets the field and is compiled anew. A new type of fields does not compile
+until the core in C can read it.
 """
 
 import json
@@ -96,8 +97,7 @@ def test_new_field_is_in_both_cores_and_in_the_export(
     tmp_path: Path, before: str, type_code: str, line: str
 ) -> None:
     compiler = there()
-    copy = tmp_path / "kontronik_can_gw"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+    copy = _copied(tmp_path)
     fields = copy / "esc" / "kontronik" / "fields.py"
     text = fields.read_text(encoding="utf-8")
     assert text.count(before) == 1
@@ -124,6 +124,29 @@ def test_new_field_is_in_both_cores_and_in_the_export(
     done = subprocess.run(run, cwd=folder, capture_output=True, text=True, check=True, timeout=60)
     sent = (words.partition("#")[2] for words in done.stdout.split())
     assert SENT[-1] in _values(filter(None, sent))
+
+
+def test_wire_type_that_c_cannot_read_does_not_compile(tmp_path: Path) -> None:
+    there()
+    c_header = _copied(tmp_path) / "esc" / "kontronik" / "c_header.py"
+    text = c_header.read_text(encoding="utf-8")
+    last_type = '"I": "U32"}'
+    assert text.count(last_type) == 1
+    text = text.replace(last_type, '"I": "U32", "i": "I32"}')
+    c_header.write_text(text, encoding="utf-8")
+    run = [sys.executable, "-m", "kontronik_can_gw.native.compile"]
+    done = subprocess.run(
+        run, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 1
+    assert "kcg_field_has_a_case_for_each_type" in done.stderr
+
+
+def _copied(folder: Path) -> Path:
+    """Return a copy of the package without its shared objects."""
+    copy = folder / "kontronik_can_gw"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+    return copy
 
 
 def _values(frames: Iterable[str]) -> set[int]:

@@ -48,7 +48,8 @@ def wire_header() -> str:
 
 def _types() -> str:
     names = ", ".join(f"KCG_{name}" for name in TYPE_NAMES.values())
-    return f"/* Types of fields. All are little-endian. */\nenum {{ {names} }};\n"
+    comment = "/* Types of fields, then their number. All are little-endian. */"
+    return f"{comment}\nenum {{ {names}, KCG_WIRE_TYPES }};\n"
 
 
 def _sizes() -> str:
