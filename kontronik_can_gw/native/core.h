@@ -374,7 +374,10 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
 
 /* A bit in the result of kcg_receive. */
 enum { KCG_AGAIN = 1 << 30 };
-/* Processes 0 to 4096 bytes of an ESC, which were read at `now`. Returns an event.
+/* Processes bytes of an ESC, which were read at `now`. Returns an event.
+   size: 0 to 2^30, because positions in the stream have 32 bits. The events of each frame are
+   returned before the next frame is processed, but only KCG_FOUND frames can be stored for this. If
+   `mask` is not 0 and the bytes contain more, the events of the first frames are returned together.
    since: a time, 0 <= since <= now, before the first of these bytes arrived. Use the last time at
    which the receive buffer was known to be empty.
    If the result has KCG_AGAIN, the bytes were not processed, because values expired before. Handle

@@ -14,7 +14,10 @@ FOLDER = Path(__file__).parent
 NOT_BUILT = FOLDER / "not_built.txt"
 """The reason why the installation made no object. hatch_build.py writes it."""
 OPTIONS = ("-DKCG_DATA=64", "-DKCG_FLOATS=1", "-DKCG_SLOTS=1", "-DKCG_FOUND=512", "-DKCG_SLICES=8")
-"""Options of the compiler: CAN FD, floats and slots, for reads of 16 KiB."""
+"""Options of the compiler: CAN FD, floats and slots.
+
+KCG_FOUND is enough for the frames of KCG_MAX_READ bytes, which are 16 KiB (offline.h).
+"""
 _SEALED = 0x2144_DF1C
 """The CRC-32 of any data followed by their own CRC-32."""
 _IN_32_BITS = {"x86_64": "i686", "aarch64": "armv7l", "armv8l": "armv7l"}

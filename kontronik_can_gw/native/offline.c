@@ -8,6 +8,10 @@
 #define MAX_COUNT (INT64_C(1) << 48)
 #define SAME_ROW (5 * MS)       /* Readings of several ESCs within this time are in one row. */
 #define GATEWAY_EACH (100 * MS) /* Between two reads of the gateway's values. */
+/* Does not compile if one kcg_receive can find more frames than the core stores: the rows need the
+   events of each frame. */
+typedef char kcg_max_read_is_too_large_for_kcg_found
+    [(KCG_MAX_READ + KCG_MAX_HELD) / KCG_SHORTEST_FRAME <= KCG_FOUND ? 1 : -1];
 /* Kinds of entries (twin: capture/format.py, Kind). */
 enum { BYTES = 1, FRAME = 2, ADVANCE = 3, COUNTERS = 14, NOT_SENT = 18 };
 enum {

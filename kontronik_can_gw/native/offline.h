@@ -23,7 +23,7 @@ enum {
     KCG_OTHER_ENTRY /* The next entry is one for the owner. */
 };
 enum {
-    KCG_MAX_READ = 16384, /* Bytes that are given to the core at once. */
+    KCG_MAX_READ = 16384, /* Bytes of one kcg_receive. KCG_FOUND frames are enough for them. */
     KCG_MAX_ROWS = 1024   /* Rows that one call of the core can make. */
 };
 

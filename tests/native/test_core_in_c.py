@@ -210,5 +210,6 @@ def test_the_core_stays_in_its_memory_and_has_no_undefined_behaviour(tmp_path: P
 
 
 def test_an_object_of_other_sources_is_refused_in_one_line(tmp_path: Path) -> None:
+    options = [option.replace("KCG_DATA=64", "KCG_DATA=8") for option in OPTIONS]
     with pytest.raises(WrongObject, match="made of other sources"):
-        load(built(tmp_path / "small.so", "-DKCG_DATA=8", "-DKCG_SLOTS=1"))
+        load(built(tmp_path / "small.so", *options))

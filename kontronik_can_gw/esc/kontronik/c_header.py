@@ -8,7 +8,7 @@ installation compiles the core before it installs anything.
 import struct
 from collections.abc import Iterator
 
-from kontronik_can_gw.esc.kontronik.codec import FORMS, MAX_LENGTH, Form, Layout
+from kontronik_can_gw.esc.kontronik.codec import FORMS, MAX_LENGTH, MIN_LENGTH, Form, Layout
 from kontronik_can_gw.esc.kontronik.fields import (
     VARIANT_BITS,
     DataType,
@@ -59,6 +59,7 @@ def _sizes() -> str:
         ("KCG_LIVE_SIZE", live, "bytes of the fields of live data"),
         ("KCG_INFO_SIZE", info, "bytes of the fields of info data"),
         ("KCG_BODY_SIZE", max(live, info), "the larger of the two"),
+        ("KCG_SHORTEST_FRAME", MIN_LENGTH, "bytes, with header and CRC"),
         ("KCG_LONGEST_FRAME", MAX_LENGTH, "bytes, with header and CRC"),
         ("KCG_MAX_HELD", MAX_LENGTH - 1, "bytes that can be undecided"),
         ("KCG_VARIANT_BITS", VARIANT_BITS, "low bits of device_and_variant"),

@@ -74,6 +74,7 @@ FORMS_BY_HEADER = {
 }
 for _shorter, _longer in FORMS_BY_HEADER.values():
     _longer.crc_part = slice(_shorter.covered, _longer.covered)
+MIN_LENGTH = min(form.length for form in FORMS)
 MAX_LENGTH = max(form.length for form in FORMS)
 
 
