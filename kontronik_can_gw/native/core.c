@@ -9,16 +9,16 @@
 /* Does not compile if the condition is 0. The name is in the compiler's message. */
 #define ASSERT_AT_COMPILE_TIME(name, condition) typedef char name[(condition) ? 1 : -1]
 
-/* kcg_sending.why. */
+/* kcg_sending.why: the reasons why a message is pending. */
 enum {
-    CYCLE = 1,
-    REQUEST = 2,
-    TURNED = 4 /* The page of this cycle was chosen. */
+    CYCLE = 1,   /* Its cycle is due. It is sent in any case. */
+    REQUEST = 2, /* It was requested. It is sent if is_news returns 1. */
+    TURNED = 4   /* Its cycle is due, as with CYCLE, and the page of this cycle was chosen. */
 };
 /* kcg.page. */
 enum {
     KNOWN = 1,  /* The bits of its last frame are in kcg.last. */
-    TO_SEND = 2 /* It must be sent without a further event. */
+    TO_SEND = 2 /* It is queued: it must be sent without a further event. */
 };
 /* kcg_slot.state. */
 enum {
@@ -87,8 +87,9 @@ uint32_t kcg_crc32(uint32_t crc, const uint8_t *p, size_t n)
 
 /* --- bytes to UART frames (twin: esc/kontronik/deframer.py) ----------------------------------- */
 
-/* The four forms of frames, by [is info][is V4]. */
+/* The four forms of frames, by [is info][LEGACY_FORM or V4_FORM]. */
 static const struct { uint8_t length, covered; } forms[2][2] = KCG_FRAME_FORMS;
+enum { LEGACY_FORM, V4_FORM, NO_FORM };
 
 /* Counts the bytes b[from] to b[to - 1] as dropped: under `blame` before `blame_until`, then under
    `reason`. */
@@ -111,8 +112,8 @@ static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reaso
     e->count[reason] += size - blamed;
 }
 
-/* Drops the four bytes of a header that begins no frame. The rest of `length` bytes is blamed on it
-   as far as it is dropped, too. */
+/* Drops the four bytes of a header that begins no frame, and counts them under `reason`. Of the
+   `length` bytes from the header on, those that are dropped later are counted under it, too. */
 static void reject(kcg_esc *e, const uint8_t *b, size_t at, size_t length, int reason)
 {
     uint32_t end = e->base + (uint32_t)(at + length);
@@ -163,9 +164,12 @@ static size_t header_at(const uint8_t *b, size_t from, size_t size)
    deframer.has_longer_crc). */
 static int has_longer_crc(const uint8_t *f)
 {
-    size_t covered = forms[0][0].length - 4u;
+    size_t covered = forms[0][LEGACY_FORM].length - 4u;
     return kcg_crc32(0, f, covered) == u32(f + covered);
 }
+
+ASSERT_AT_COMPILE_TIME(legacy_live_counter_follows_v4, KCG_N_LIVE_LEGACY == KCG_N_LIVE_V4 + 1);
+ASSERT_AT_COMPILE_TIME(legacy_info_counter_follows_v4, KCG_N_INFO_LEGACY == KCG_N_INFO_V4 + 1);
 
 /* Finds the frames in b[0] to b[size - 1]. e->base is the position of b[0] in the stream.
    ended: no further bytes follow. Returns how many bytes are decided, and sets e->need. */
@@ -194,34 +198,36 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
             at += 3;
             continue;
         }
-        /* Try the shorter form first. The CRC of the longer form continues its CRC. */
-        int is_info = f[3] == 'I', v4 = !KCG_LEGACY;
+        /* Try the legacy form first, because it is shorter. The CRC of the V4 form begins with the
+           same bytes, so it is continued from there. The loop ends with the form whose CRC is
+           right, with a form for which bytes are missing, or with NO_FORM. */
+        int is_info = f[3] == 'I', form = KCG_LEGACY ? LEGACY_FORM : V4_FORM;
         uint32_t crc = 0;
         size_t missing = 0, covered = 0;
-        for (; v4 < 2; v4++) {
-            size_t n = forms[is_info][v4].length;
+        for (; form < NO_FORM; form++) {
+            size_t n = forms[is_info][form].length;
             if (have < n) {
                 missing = n - have;
                 break;
             }
-            crc = kcg_crc32(crc, f + covered, forms[is_info][v4].covered - covered);
-            covered = forms[is_info][v4].covered;
+            crc = kcg_crc32(crc, f + covered, forms[is_info][form].covered - covered);
+            covered = forms[is_info][form].covered;
             if (crc == u32(f + n - 4))
                 break;
         }
-        if (v4 == 2) {
+        if (form == NO_FORM) {
             e->count[KCG_N_HEADERS]++;
             e->count[KCG_N_CRC_ERRORS]++;
             e->count[KCG_N_LONGER_CRCS] += !is_info && has_longer_crc(f);
-            reject(e, b, at, forms[is_info][1].length, KCG_N_DROPPED_CRC);
+            reject(e, b, at, forms[is_info][V4_FORM].length, KCG_N_DROPPED_CRC);
             at += 4;
         } else if (!missing) {
             e->count[KCG_N_HEADERS]++;
-            e->count[(is_info ? KCG_N_INFO_V4 : KCG_N_LIVE_V4) + !v4]++;
-            at += forms[is_info][v4].length;
+            e->count[(is_info ? KCG_N_INFO_V4 : KCG_N_LIVE_V4) + (form == LEGACY_FORM)]++;
+            at += forms[is_info][form].length;
             uint32_t end = e->base + (uint32_t)at;
             e->blame_until = end;
-            found(g, e, is_info, v4, f + 4, end);
+            found(g, e, is_info, form == V4_FORM, f + 4, end);
         } else if (ended) {
             e->count[KCG_N_HEADERS]++;
             reject(e, b, at, have, KCG_N_DROPPED_INCOMPLETE);
@@ -241,6 +247,8 @@ static void hold(kcg_esc *e, const uint8_t *data, size_t size)
     memmove(e->held, data, size);
     e->held_count = (uint8_t)size;
 }
+
+ASSERT_AT_COMPILE_TIME(held_bytes_are_less_than_a_frame, KCG_LONGEST_FRAME - KCG_MAX_HELD >= 1);
 
 /* Takes the next bytes of the stream. */
 static void feed(kcg *g, kcg_esc *e, const uint8_t *data, size_t size)
@@ -262,7 +270,8 @@ static void feed(kcg *g, kcg_esc *e, const uint8_t *data, size_t size)
             hold(e, e->held + at, old + more - at);
             return;
         }
-        /* The first undecided byte is in `data`, because at most KCG_MAX_HELD bytes were held. */
+        /* The first undecided byte is in `data`: KCG_LONGEST_FRAME bytes of `data` were scanned,
+           and at most KCG_MAX_HELD bytes, which are less, are undecided after a scan. */
         data += at - old;
         size -= at - old;
         e->held_count = 0;
@@ -283,6 +292,9 @@ static void flush(kcg *g, kcg_esc *e)
 
 /* --- state of an ESC (twins: core/esc_stream.py, esc/telemetry.py) ---------------------------- */
 
+/* A type without a case in kcg_field would be read as KCG_U32. */
+ASSERT_AT_COMPILE_TIME(kcg_field_has_a_case_for_each_type, KCG_WIRE_TYPES == 5);
+
 /* Returns a field of live data or info data. The macros of wire.h call this. */
 static inline int64_t kcg_field(const uint8_t *body, int offset, int type)
 {
@@ -292,9 +304,7 @@ static inline int64_t kcg_field(const uint8_t *body, int offset, int type)
     case KCG_I8: return (int8_t)p[0];
     case KCG_U16: return (uint16_t)(p[0] | p[1] << 8);
     case KCG_I16: return (int16_t)(p[0] | p[1] << 8);
-/* A type without a case in kcg_field would be read as KCG_U32. */
-ASSERT_AT_COMPILE_TIME(kcg_field_has_a_case_for_each_type, KCG_WIRE_TYPES == 5);
-
+    case KCG_U32:
     default: return u32(p);
     }
 }
@@ -304,7 +314,6 @@ uint64_t kcg_count(const kcg_esc *e, int what)
     const uint64_t *n = e->count;
     switch (what) {
     case KCG_N_LIVE_FRAMES: return n[KCG_N_LIVE_V4] + n[KCG_N_LIVE_LEGACY];
-    case KCG_U32:
     case KCG_N_INFO_FRAMES: return n[KCG_N_INFO_V4] + n[KCG_N_INFO_LEGACY];
     case KCG_N_DROPPED_BYTES:
         return n[KCG_N_DROPPED_NOISE] + n[KCG_N_DROPPED_CRC] + n[KCG_N_DROPPED_UNKNOWN_KIND] +
@@ -689,6 +698,7 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
     if (s->flags & KCG_PLAIN) {
         v = x;
     } else if (x > s->most || x < -s->most) {
+        /* Beyond the limits. If the factor is negative, a large x is below `low`. */
         int is_below = (x < 0) == (s->mul > 0);
         return s->flags & KCG_SATURATES && is_below ? (uint64_t)s->low : s->error;
     } else {
@@ -697,7 +707,7 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
     if (s->flags & KCG_ROLLS)
         return (uint64_t)v % ((uint64_t)s->high + 1);
     if (s->flags & KCG_SATURATES && v < s->low)
-        return (uint64_t)s->low; /* above `high`, `error` is `high` */
+        return (uint64_t)s->low; /* a value above `high` becomes `error`, which equals `high` */
     if (v > s->high || v < s->low || (s->flags & KCG_CODE_AMID && (uint64_t)v == s->not_available))
         return s->error;
     return (uint64_t)v;
@@ -784,20 +794,20 @@ static int may_go(const kcg *g, uint32_t i, int64_t now)
 
 /* --- messages (twin: core/messages.py) -------------------------------------------------------- */
 
-/* Lets a page be sent without a further event. */
-static void let_follow(kcg *g, uint32_t i, int place)
+/* Queues a page: it is sent without a further event. */
+static void queue_page(kcg *g, uint32_t i, int place)
 {
     uint8_t *page = &g->page[g->plan->message[i].first_page + place];
     g->sending[i].pages_to_send = (uint8_t)(g->sending[i].pages_to_send + !(*page & TO_SEND));
     *page |= TO_SEND;
 }
 
-/* Lets all pages of a message with several pages be sent without a further event. */
-static void let_all_follow(kcg *g, uint32_t i)
+/* Queues all pages of a message, if it has several. */
+static void queue_all_pages(kcg *g, uint32_t i)
 {
     int pages = PAGES_OF(&g->plan->message[i]);
     for (int place = 0; pages > 1 && place < pages; place++)
-        let_follow(g, i, place);
+        queue_page(g, i, place);
 }
 
 static int page_after(const kcg_message *m, int place)
@@ -805,15 +815,15 @@ static int page_after(const kcg_message *m, int place)
     return place + 1 < m->pages ? place + 1 : 0;
 }
 
-/* Lets the next page be sent, and turns to the page after it. */
+/* Queues the next page, and turns to the page after it. */
 static void turn_page(kcg *g, uint32_t i)
 {
     kcg_sending *s = &g->sending[i];
-    let_follow(g, i, s->page);
+    queue_page(g, i, s->page);
     s->page = (uint8_t)page_after(&g->plan->message[i], s->page);
 }
 
-/* Returns the page to be sent next: the first one to be sent, beginning at the next page. */
+/* Returns the page to be sent: the first queued page, counted from the next page on. */
 static int next_of_pages(kcg *g, uint32_t i)
 {
     const kcg_message *m = &g->plan->message[i];
@@ -843,7 +853,7 @@ static void mark(kcg *g, uint32_t i, int64_t since, int why)
     s->why = (uint8_t)(s->why | why);
 }
 
-/* Returns 1 if a message that is sent on change has changed. Marks its changed pages to be sent. */
+/* Returns 1 if a message that is sent on change has changed. Queues its changed pages. */
 static int has_changed(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
@@ -856,7 +866,7 @@ static int has_changed(kcg *g, uint32_t i, int64_t now)
             memcmp(bits, last, WORDS_OF(m) * sizeof *bits)) {
             changed = 1;
             if (PAGES_OF(m) > 1)
-                let_follow(g, i, place);
+                queue_page(g, i, place);
         }
     }
     return changed || g->sending[i].pages_to_send;
@@ -970,7 +980,10 @@ static void slot_sent(kcg *g, uint32_t i, int64_t now)
     const kcg_message *m = &g->plan->message[i];
     kcg_sending *s = &g->sending[i];
     kcg_slot *slot = slot_of(g, i);
-    /* A paced slot keeps its rate on average: its frame counts as sent at the planned time. */
+    /* A paced slot is sent with an event after `delay`, or without one after `cycle`. Its owner
+       places both at the same distance around the wanted period, so the period is their mean. The
+       next distances count from the planned time of this frame. So a frame that is early or late
+       by less than a period does not move the later ones, and the rate is kept on average. */
     int64_t period = (m->delay + m->cycle) / 2;
     int64_t planned = s->last + period;
     int is_on_time = planned - period < now && now < planned + period;
@@ -982,8 +995,8 @@ static void slot_sent(kcg *g, uint32_t i, int64_t now)
     restart_timer(g, i, s->last);
 }
 
-/* Returns 1 if a paced slot rests, because its first value is not available. The first event after
-   that sends it. */
+/* Returns 1 if a paced slot rests, because its first value is not available. It has no timer then,
+   and the first event with an available value sends it at once. */
 static int slot_rests(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
@@ -1116,7 +1129,9 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
 {
     const kcg_plan *plan = g->plan;
     const kcg_esc *e = &g->esc[esc];
-    int is_lost = !e->has_live || (events & KCG_INFO && !e->has_info);
+    /* Without live data, or when the info has just expired, there may be no later event that
+       requests the further pages. */
+    int has_lost_data = !e->has_live || (events & KCG_INFO && !e->has_info);
     for (int k = plan->first_listener[esc]; k < plan->first_listener[esc + 1]; k++) {
         uint32_t i = plan->listener[k];
         const kcg_message *m = &plan->message[i];
@@ -1126,11 +1141,11 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
         }
         int hit = m->triggers & events;
         if (e->has_live && m->flags & KCG_EVENT && m->triggers & KCG_LIVE)
-            hit &= ~KCG_LINK; /* live frames determine when it is sent */
+            hit &= ~KCG_LINK; /* each live frame requests it already */
         if (!hit)
             continue;
-        if (is_lost && m->flags & KCG_EVENT)
-            let_all_follow(g, i);
+        if (has_lost_data && m->flags & KCG_EVENT)
+            queue_all_pages(g, i);
         if (g->sending[i].why)
             continue;
         if (m->flags & KCG_FREE)
@@ -1156,7 +1171,7 @@ void kcg_repeat(kcg *g, int64_t now)
         for (int place = 0; place < PAGES_OF(m); place++)
             g->page[m->first_page + place] &= TO_SEND;
         if (!m->cycle) {
-            let_all_follow(g, i);
+            queue_all_pages(g, i);
             request(g, i, now);
         }
     }
@@ -1170,7 +1185,7 @@ void kcg_stop(kcg *g, int64_t now)
         if (!(m->flags & KCG_OF_THE_GATEWAY))
             continue;
         if (m->flags & KCG_EVENT)
-            let_all_follow(g, i);
+            queue_all_pages(g, i);
         mark(g, i, now, REQUEST);
     }
 }
@@ -1258,7 +1273,9 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     kcg_sending *s = &g->sending[i];
     uint64_t bits[WORDS];
     if (s->why & CYCLE && PAGES_OF(m) > 1) {
-        s->why = REQUEST | TURNED; /* once, even if it is taken several times before it is sent */
+        /* A cycle turns one page. If kcg_sent does not report the frame, it is packed again, and
+           must not turn a further page. So CYCLE becomes TURNED. */
+        s->why = REQUEST | TURNED;
         turn_page(g, i);
     }
     int place = next_place(g, i);
@@ -1336,8 +1353,9 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
             s->why = 0;
             continue;
         }
-        int news = why & REQUEST && is_news(g, i, now);
-        if (!news && !(why & (CYCLE | TURNED))) {
+        int is_for_cycle = why & (CYCLE | TURNED);
+        int has_news = why & REQUEST && is_news(g, i, now);
+        if (!has_news && !is_for_cycle) {
             s->why = 0;
             continue;
         }
@@ -1368,7 +1386,8 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
         int place = next_place(g, i);
         uint8_t *page = &g->page[m->first_page + place];
         if (KCG_PAGED) {
-            s->pages_to_send = (uint8_t)(s->pages_to_send - (*page / TO_SEND & 1));
+            int was_queued = (*page & TO_SEND) != 0;
+            s->pages_to_send = (uint8_t)(s->pages_to_send - was_queued);
             *page &= KNOWN;
         }
         if (m->flags & KCG_ON_CHANGE) {
@@ -1522,11 +1541,14 @@ int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, 
     g->again = 0;
     if (e->arrivals && now - e->arrival_bound[0] > e->settings.timeout)
         flush(NULL, e);
-    /* The last byte arrived after the others. A pseudo terminal is faster than the wire. */
+    /* The earliest arrival of the last byte: the first byte arrived after `since`, and each further
+       byte takes KCG_BYTE_NS on the wire. Not after `now`, because a pseudo terminal is faster. */
     int64_t bound = earlier(now, since + ((int64_t)size - 1) * KCG_BYTE_NS);
     g->read_esc = esc;
     g->read_now = now;
     g->read_bound = bound;
+    /* Ages count from the read, if it was at most the mean interval of live frames after that.
+       Otherwise the bytes may have waited for long, and ages count from their earliest arrival. */
     g->read_shown = now - bound <= e->interval ? now : bound;
     g->read_end = e->base + e->held_count + (uint32_t)size;
     g->found_count = g->found_at = 0;

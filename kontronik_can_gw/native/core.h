@@ -69,7 +69,8 @@ enum {
 /* A CAN frame with the same layout as SocketCAN's struct can_frame or canfd_frame. */
 typedef struct {
     uint32_t id; /* Bit 31 is set for a 29-bit id. */
-    /* page: index of the multiplexer's page. The kernel ignores this field. */
+    /* page: index of the multiplexer's page. The bytes `page` and `reserved` are reserved in
+       SocketCAN, and the kernel passes them on to other programs. So linux.c sends `page` as 0. */
     uint8_t length, flags, page, reserved;
     uint8_t data[KCG_DATA];
 } kcg_frame;
@@ -88,7 +89,9 @@ enum {
     KCG_OF_GATEWAY, /* A value of the gateway. `place`: index into kcg.gateway. */
     KCG_OF_UPTIME,  /* Time since gateway[KCG_STARTED_NS], in ms. */
     KCG_OF_ALIVE,   /* The message's alive counter, modulo `div`. */
-    KCG_OF_STATUS,  /* Link state. Bit 6: the gateway's state is `place`. Bit 7: info is fresh. */
+    /* Link state. Bit 6: a recording is replayed, which is the gateway's state with the number
+       `place`. Bit 7: info is fresh. */
+    KCG_OF_STATUS,
     KCG_OF_DIRECTED /* As KCG_OF_LIVE, but negative while the live byte at offset `state_place` is
                        the number of a bit that is set in `negative_states`. */
 };
@@ -151,7 +154,9 @@ enum {
     KCG_TABLE = 8,      /* The raw value is looked up in kcg_plan.pair. */
     KCG_REAL = 16,      /* The signal is a float. */
     KCG_DIRECT = 32,    /* Live data that every device supplies, without a divisor. */
-    KCG_SATURATES = 64  /* A value below `low` is sent as `low`, a value above `high` as `error`. */
+    /* A value below `low` is sent as `low`, and a value above `high` as `high`. The tables have
+       `high` in `error`, too. Without this flag, both are sent as `error`. */
+    KCG_SATURATES = 64
 };
 /* kcg_message.flags. */
 enum {
@@ -162,7 +167,9 @@ enum {
     KCG_OF_THE_GATEWAY = 16, /* Has values of the gateway, and is sent by kcg_gateway_changed. */
     KCG_FREE = 32,           /* Has neither cycle nor minimum distance, and one page. */
     KCG_TRANSFER = 64,       /* Slots only: several frames with a CRC-16, as in DroneCAN. */
-    KCG_PACED = 128          /* Slots only: sent with an event, at its rate on average. */
+    /* Slots only: a measurement at a rate. It is sent with the first event after `delay`, and after
+       `cycle` without an event. The period on average is their mean. */
+    KCG_PACED = 128
 };
 /* kcg_frame.page of the frames of transfers: from KCG_FIRST_PART on, each KCG_PARTS numbers belong
    to one transfer. */
@@ -173,8 +180,10 @@ enum { KCG_FIRST_PART = KCG_PAGES, KCG_PARTS = 3 };
 typedef struct { uint8_t shift, width; uint16_t at; } kcg_piece;
 /* A number of an enumeration, and the raw value that is sent for it. */
 typedef struct { int64_t number; uint64_t raw; } kcg_pair;
-/* A signal: source, scale and place of a value. The raw value of an integer is
-   floor((x * mul * over + add * by) / (div * by)), for x steps divided by the ESC's by / over. */
+/* A signal: source, scale and place of a value. The value is x * over / by, in steps: x is the
+   number from the source, and the fraction by / over is the divisor of the ESC (`divisor`), for
+   example its pole pairs times its gear. The raw value of an integer is value * mul / div +
+   add / div, rounded down once: floor((x * mul * over + add * by) / (div * by)). */
 typedef struct {
     /* kind: KCG_OF_... page: index of the page, or KCG_PAGES if the signal is on all pages.
        esc: number of the ESC, or 255 for a value of the gateway.
@@ -264,7 +273,8 @@ typedef struct {
     uint64_t energy;            /* In mW s. */
     int64_t energy_rest;        /* The rest in mW ns. */
     int64_t run_time;
-    int64_t live_ns, live_bound; /* Newest live frame: its time, and the earliest possible time. */
+    /* Arrival of the newest live frame: as ages count it, and the earliest possible one. */
+    int64_t live_ns, live_bound;
     int64_t info_bound, last_info_ns;
     int64_t window_ns;          /* Beginning of the current second. */
     int64_t interval;           /* Mean time between live frames in the last second, or 0. */
@@ -305,7 +315,10 @@ typedef struct {
     uint8_t body[KCG_BODY_SIZE];
 } kcg_found;
 
-/* The core. The owner writes only `mask` and `gateway`. */
+/* The core. The owner writes only `mask` and `gateway`. Two parts of the gateway itself write more:
+   offline.c passes on frames from one core to another (`found`, `read_...`, kcg_esc.count), and
+   native/state.py restores sums and counters at the beginning of a later part of a capture
+   (`energy`, `energy_rest`, `run_time` and `count` of kcg_esc). */
 typedef struct {
     const kcg_plan *plan;
     kcg_esc *esc;
@@ -325,7 +338,7 @@ typedef struct {
     uint32_t read_end;     /* Position in the stream after the bytes that were read. */
     int64_t read_now;      /* Time of the read. */
     int64_t read_bound;    /* The last byte arrived at this time at the earliest. */
-    int64_t read_shown;    /* Time that the last byte is given. */
+    int64_t read_shown;    /* Arrival of the last byte as ages count it: read_now or read_bound. */
     int64_t second;        /* Beginning of the current second of the gateway's values. */
     int64_t next_expiry;   /* The earliest deadline of all ESCs; 0: unknown. */
     int64_t gateway[KCG_OF_GATEWAY_COUNT]; /* States and counters of the gateway. */
@@ -367,7 +380,8 @@ extern "C" {
 /* Returns the size in bytes of the memory for a complete plan, as KCG_SIZE does. */
 size_t kcg_size(const kcg_plan *plan);
 /* Starts a core and returns `memory`. Call it again to restart the core.
-   memory: kcg_size bytes, aligned for int64_t. Afterwards only the core may write them.
+   memory: kcg_size bytes, aligned for int64_t. Afterwards only the core may write them, except
+   `mask` and `gateway` (see kcg).
    settings: one for each ESC, with timeout > 0, poles >= 1 and both parts of the gear >= 1. They
    are copied. */
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now);
