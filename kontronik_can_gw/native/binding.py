@@ -37,7 +37,11 @@ class WrongObject(RuntimeError):
 def load(path: Path) -> Any:
     """Return the shared object with its functions declared. Raises WrongObject if it is wrong."""
     try:
-        library: Any = c.PyDLL(str(path))  # other threads of Python run only while a turn waits
+        # A function of PyDLL keeps the GIL. kcg_turn is a function of CDLL, which releases the GIL
+        # for the whole call, because the call waits. Other threads run meanwhile. They must neither
+        # call the core nor read or write its memory and that of its Turns: NativeCore, its ``escs``
+        # and its ``status``. They are given copies (``frozen``) between two calls.
+        library: Any = c.PyDLL(str(path))
         released: Any = c.CDLL(str(path))
         library.kcg_turn = released.kcg_turn
         for name, (result, *arguments) in functions():

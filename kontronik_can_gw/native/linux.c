@@ -2,8 +2,10 @@
 
    The twins in Python describe each rule: runtime/loop.py (Loop.turn), runtime/poller.py,
    runtime/ports (serial_port.py and esc_port.py: reading, and since when bytes can have arrived),
-   gateway/transmit_queue.py (frames that wait) and runtime/can/socketcan_port.py (sending). The
-   loop does everything else: its next turn follows at once with all that is ready. */
+   gateway/transmit_queue.py (frames that wait) and runtime/can/socketcan_port.py (sending).
+
+   In this file "the loop" is the loop in Python. It does everything that these turns do not do: its
+   next turn follows at once with all that is ready. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <poll.h>
@@ -93,7 +95,8 @@ static int serve(kcg_turns *t)
     return 1;
 }
 
-/* Gives `count` frames to the kernel. Returns the number that it took, or -1 with errno. */
+/* Gives `count` frames to the kernel, with `page` 0 (see kcg_frame). Returns the number that it
+   took, or -1 with errno. */
 static int send_frames(int bus, kcg_frame *frame, uint32_t count)
 {
     struct mmsghdr m[KCG_AT_ONCE];
@@ -206,7 +209,15 @@ static void take_pending(kcg_turns *t, int had_waiting)
     }
 }
 
-/* Sends pending frames, or lets them wait for the bus. Returns 0 if the loop has to go on. */
+/* Returns 1 if no frame waits, or if the bus has not been full for so long that the loop has to
+   handle it. */
+static int may_wait(const kcg_turns *t)
+{
+    return !t->queue.count || t->times.now - t->queue.full_since < MAX_FULL;
+}
+
+/* Sends pending frames, or lets them wait for the bus. Returns 0 if the loop has to take over. Then
+   it also sends the frames in the queue. */
 static int transmit(kcg_turns *t)
 {
     kcg_turn_queue *q = &t->queue;
@@ -217,15 +228,19 @@ static int transmit(kcg_turns *t)
             uint32_t waiting = q->count;
             int result = hand_over(t);
             int is_full = result < 0 && errno == EAGAIN;
-            if (q->count < waiting || !before || !is_full)
+            int is_still_full = is_full && before && q->count == waiting;
+            if (!is_still_full)
                 q->full_since = t->times.now;
-            if (q->count && (!is_full || t->request.is_recorded || q->from_outputs))
+            /* The loop handles errors and late frames. It also handles a full bus if the calls of
+               the core are recorded, or if frames of outputs wait. */
+            int can_wait_in_c = is_full && !t->request.is_recorded && !q->from_outputs;
+            if (q->count && !can_wait_in_c)
                 return 0;
             t->core->gateway[KCG_SEND_FAILURES] += is_full;
             watch_room(t, is_full);
         }
-    } while (t->core->pendings && !q->count);
-    return !t->core->pendings && (!q->count || t->times.now - q->full_since < MAX_FULL);
+    } while (t->core->pendings && !q->count); /* pending frames that had no room in the queue */
+    return !t->core->pendings && may_wait(t);
 }
 
 int kcg_watch(kcg_turns *t)
@@ -318,7 +333,10 @@ static int wait_for_turn(kcg_turns *t)
     int64_t due = earlier(kcg_next_deadline(t->core), earlier(request->due, request->outputs_due));
     int64_t poll_all = t->times.polled + request->period;
     int64_t begun = now_ns();
-    int64_t round_up = poll_all < due ? 0 : MS - 1; /* a deadline must have passed after the wait */
+    /* The wait ends by a deadline or by the next poll of all descriptors. A deadline must have
+       passed after the wait, so that wait is rounded up. The poll must not be late, so that wait is
+       rounded down. */
+    int64_t round_up = poll_all < due ? 0 : MS - 1;
     due = earlier(due, poll_all);
     int64_t last = t->times.now;
     int64_t pause = due > begun ? due - begun : 0;
@@ -364,7 +382,7 @@ static int turn(kcg_turns *t)
             return 0;
     if (*event < 0 && !r->has_advanced) {
         if (is_idle(t))
-            return !t->queue.count || t->times.now - t->queue.full_since < MAX_FULL;
+            return may_wait(t);
         note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);
         *event = kcg_advance(t->core, t->times.now);
         r->has_advanced = 1;

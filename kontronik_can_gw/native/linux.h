@@ -21,9 +21,12 @@ enum { KCG_NOTE_BYTES = 1, KCG_NOTE_ADVANCE = 3 }; /* Kinds of entries (capture/
 
 /* The port of an ESC (twin: poller.PortInput, which describes the fields of the same name). */
 typedef struct {
-    int64_t empty_ns;     /* The port was empty at this time. */
-    int64_t asked_ns;     /* The port was empty at this time, too: the last poll. */
-    int64_t undrained_ns; /* The last read left bytes that arrived after this; or KCG_DRAINED. */
+    /* empty_ns: the loop opened and emptied the port at this time. C only reads it.
+       asked_ns: the last time at which C knows that the port was empty. A run begins with empty_ns
+       or with the loop's last poll, and each poll of C that finds the port empty moves it.
+       undrained_ns: bytes that are in the port now arrived after this time. KCG_DRAINED: the port
+       was empty at the last poll, so bytes arrived after asked_ns. */
+    int64_t empty_ns, asked_ns, undrained_ns;
     uint8_t is_plain, served, esc;
     uint8_t restored;     /* Another program had changed the settings, and they were set again. */
     uint8_t reserved[4];
@@ -62,7 +65,7 @@ typedef struct {
     uint32_t turns;    /* Turns since kcg_begin. */
     uint32_t taken;    /* Frames that the core and the outputs made since kcg_begin. */
     uint32_t recorded; /* Bytes in `ring`. */
-    uint32_t is_over;  /* 1: the last turn is complete. */
+    uint32_t is_over;  /* 1: the last turn is complete, and no frame waits in `queue`. */
 } kcg_turn_result;
 
 /* The reads of the current turn. */
@@ -110,13 +113,21 @@ typedef struct {
 int kcg_watch(kcg_turns *t);
 /* Starts a run. Call it before the first kcg_turn. */
 void kcg_begin(kcg_turns *t);
-/* Makes turns until the loop has something to do.
-   Returns 0 if the loop has to make the next turn: `ports.fds` shows which descriptors are ready.
-   Returns 1 if the owner has to follow `result.event`. Then it calls kcg_turn again, after it has
-   put the frames that outputs made of the event into `queue`. Or it calls kcg_leave: then the loop
-   makes the rest of the turn. After KCG_OUTPUTS the owner must have changed request.outputs_due. */
+/* Makes turns until Python has something to do. The owner calls it, and the loop in Python
+   (runtime/loop.py) makes the turns that C cannot make.
+
+   Returns 1 for an event, in the middle of a turn. The owner handles `result.event`, and then does
+   one of these:
+   a. It puts the frames that the outputs made of the event into `queue`, and calls kcg_turn again,
+      which continues the turn. After KCG_OUTPUTS, request.outputs_due must be a new time.
+   b. It calls kcg_leave. Then the loop makes the rest of the turn.
+
+   Returns 0 at the end of the run. Then the loop serves the descriptors that are ready, which are
+   in `ports.fds`, and sends the frames that are left in `queue`. If result.is_over is 0, it also
+   does the work that is due. If result.is_over is 1 and no descriptor is ready, it has nothing to
+   do. */
 int kcg_turn(kcg_turns *t);
-/* Ends a run after an event. */
+/* Ends the run after kcg_turn has returned 1. */
 void kcg_leave(kcg_turns *t);
 /* Returns the size of kcg_turns. */
 uint32_t kcg_turns_size(void);
