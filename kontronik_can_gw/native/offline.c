@@ -204,7 +204,7 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
         uint32_t kind = e[8];
         uint32_t esc = e[10] | (uint32_t)e[11] << 8;
         uint32_t length = u32(e + 12);
-        uint32_t before = o->count;
+        uint32_t sure = o->count; /* a later NOT_SENT drops only frames of this entry */
         uint64_t time = u64(e);
         if (time >= END_OF_TIME || o->last >= END_OF_TIME)
             return KCG_OTHER_ENTRY;
@@ -221,16 +221,17 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
             if (is_full(o))
                 return KCG_IS_FULL;
             advance(o, now);
-            o->core->gateway[SENT_FRAMES] += o->count - before;
+            o->core->gateway[SENT_FRAMES] += o->count - sure;
         } else if (kind == COUNTERS && are_counters(data, length)) {
             for (int k = 0; k < COUNTERS_COUNT; k++)
                 o->core->gateway[SENT_FRAMES + k] = (int64_t)u64(data + k * TIME);
         } else if (kind == NOT_SENT) {
-            before = o->count = o->sure;
+            o->count = o->sure;
+            sure = o->count;
         } else {
             return KCG_OTHER_ENTRY;
         }
-        o->sure = before;
+        o->sure = sure;
         o->last = now;
         o->data_at += length;
     }

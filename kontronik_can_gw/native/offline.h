@@ -55,7 +55,8 @@ typedef struct {
     int64_t *row_time;
     uint32_t room;         /* Number of frames or rows that there is memory for. */
     uint32_t count;
-    uint32_t sure;         /* Frames from here on are dropped if the next entry is NOT_SENT. */
+    uint32_t sure;         /* Frames before the last entry. If the next entry is NOT_SENT, only
+                              these remain. */
     uint32_t ages, rows;   /* Number of entries of `age` and of complete rows. */
     uint32_t index;        /* The next entry of the block. */
     uint8_t is_open;       /* A row has begun. */

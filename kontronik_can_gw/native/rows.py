@@ -98,7 +98,8 @@ def settings_of(esc: EscSettings) -> Any:
 def held_settings(esc: EscSettings) -> Any:
     """Return settings that were changed at run time, as ``settings_of`` does.
 
-    Beyond the limits, the speeds that they divide are not available.
+    A CANopen master can write settings beyond the limits to object 2100h. Then the speeds that they
+    divide are not available.
     """
     has_too_many_poles = esc.pole_pairs > MAX_POLES
     has_too_fine_gear = max(esc.gear.numerator, esc.gear.denominator) > MAX_GEAR

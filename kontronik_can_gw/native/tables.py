@@ -1,9 +1,8 @@
 """Makes the tables of the core in C (core.h, kcg_plan) from compiled messages.
 
 Raises NotInCore for a message that the core in C cannot express. scale.py proves that no product
-leaves int64, for any value and any settings within the limits. A message without this proof runs
-on the core in Python. If a CANopen master writes settings beyond the limits to object 2100h, the
-speeds that they divide are not available.
+leaves int64, for any value and any settings within the limits. A single message without this proof
+raises NotInCore, too. Then the core in Python runs the whole gateway (load.py, make_core).
 """
 
 import struct
