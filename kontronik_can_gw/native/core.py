@@ -30,7 +30,7 @@ from kontronik_can_gw.status import GatewayStatus
 
 _MAX_FRAMES = 256
 _WORD = (1 << 64) - 1
-_LIVE_IN_PYTHON = "a PDO with a value that it does not have is sent in Python"
+_LIVE_IN_PYTHON = "Python handles each live frame, too: a PDO or another output needs it"
 _Core = structure("kcg")
 _Plan = structure("kcg_plan")
 _Esc = structure("kcg_esc")

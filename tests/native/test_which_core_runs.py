@@ -12,13 +12,14 @@ from types import SimpleNamespace
 import pytest
 
 from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.core.interface import Follower
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc import protocols
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native import compile as compiling
 from kontronik_can_gw.native import load, objects
@@ -190,6 +191,16 @@ def test_settings_that_the_c_core_cannot_express_run_in_python(
     assert why(protocol="other") == "ESC protocol other"
     assert why(gear=Fraction(MAX_GEAR)) == ""
     assert f"parts above {MAX_GEAR}" in why(gear=Fraction(MAX_GEAR + 1))
+
+
+@needs_c
+def test_note_of_the_c_core_tells_that_an_output_follows_live_frames() -> None:
+    core = Gateway([EscSettings()], EMPTY, 0).core
+    assert (core.language, core.note) == ("C", "")
+    core.followers = [Follower(Event.LINK | Event.LIVE, lambda *_: None)]
+    assert core.note == "Python handles each live frame, too: a PDO or another output needs it"
+    core.followers = [Follower(Event.LINK, lambda *_: None)]
+    assert core.note == ""
 
 
 @needs_c
