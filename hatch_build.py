@@ -1,4 +1,7 @@
-"""Builds the core in C at the installation where there is a C compiler; without one, or when it fails, the core in Python runs."""
+"""Compiles the core in C during the installation.
+
+Without a C compiler, or if compiling fails, the core in Python runs.
+"""
 
 import contextlib
 import os
@@ -10,11 +13,14 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from packaging.tags import sys_tags
 
 FOR_ALL = "KONTRONIK_WHEEL_FOR_ALL"
-"""Environment variable of `make wheels`: one wheel with an object for each machine that there is a cross compiler for."""
+"""Environment variable of `make wheels`, which builds one wheel with an object for each machine."""
 
 
 class CoreBuild(BuildHookInterface[Any]):
-    """Puts shared objects beside their sources. A wheel with the one of this machine says so in its tag."""
+    """Add shared objects beside their sources.
+
+    The tag of a wheel with an object names the machine.
+    """
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:  # noqa: ARG002
         sys.path.insert(0, self.root)
@@ -42,5 +48,8 @@ class CoreBuild(BuildHookInterface[Any]):
 
 
 def platform() -> str:
-    """Of a wheel for this machine, as linux_aarch64: it does not claim to run with older libraries, as a manylinux one does."""
+    """Return the platform in the tag of a wheel for this machine, for example linux_aarch64.
+
+    It is not a manylinux tag, which would promise to run with older libraries.
+    """
     return min((tag.platform for tag in sys_tags()), key=lambda name: not name.startswith("linux_"))

@@ -1,4 +1,4 @@
-"""A gateway with a simulated ESC on a virtual CAN bus, for tests of what receives its frames."""
+"""A gateway with a simulated ESC on a virtual CAN bus, for tests of a receiver."""
 
 import os
 import subprocess
@@ -14,28 +14,33 @@ DBC = Path(__file__).parents[1] / "one-esc/bus.dbc"
 
 
 class Bench:
-    """``run`` and ``simulate`` of kontronik-can-gw, each a process of its own. Nothing is faked between them and the bus."""
+    """The commands ``run`` and ``simulate`` of kontronik-can-gw, each in its own process.
+
+    Gateway and bus are real. Only the ESC is simulated.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._port = folder / "esc1"
         self._processes: list[subprocess.Popen[bytes]] = []
         config = folder / "gateway.toml"
         config.write_text(
-            f'[can]\nchannel = "{CHANNEL}"\n[run]\nwait_for_devices = true\n[[esc]]\nport = "{self._port}"\npole_pairs = 7\n'
+            f'[can]\nchannel = "{CHANNEL}"\n'
+            "[run]\nwait_for_devices = true\n"
+            f'[[esc]]\nport = "{self._port}"\npole_pairs = 7\n'
         )
         self.gateway = self._start("run", "-c", config)
 
     def plug_in(self, *options: str) -> None:
-        """The ESC appears and sends. ``options``: of kontronik-can-gw simulate."""
+        """Connect the ESC, which then sends. ``options`` are those of kontronik-can-gw simulate."""
         self.esc = self._start("simulate", "--link", self._port, *options)
 
     def unplug(self) -> None:
-        """The ESC, and its port with it, is gone."""
+        """Remove the ESC and its port."""
         self.esc.terminate()
         self.esc.wait()
 
     def bus(self, state: str) -> None:
-        """Take the bus "down", as a cable or a bus-off would, or "up" again."""
+        """Set the bus "down", like a broken cable or a bus-off does, or "up" again."""
         subprocess.run(["ip", "link", "set", CHANNEL, state], check=True)
 
     def end(self) -> None:
@@ -51,10 +56,10 @@ class Bench:
 
 
 def until(condition: Callable[[], object], limit_s: float = 30) -> None:
-    """Wait for an event; the limit is one that no working machine reaches."""
+    """Wait for a condition. No working machine reaches the limit."""
     end = time.monotonic() + limit_s
     while not condition():
-        assert time.monotonic() < end, "it did not come"
+        assert time.monotonic() < end, "the condition did not become true"
         time.sleep(0.01)
 
 
@@ -67,7 +72,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 @pytest.fixture
 def display() -> Iterator[Display]:
-    """The receiver under test. Put yours in its place."""
+    """Return the receiver under test. Replace it by your own."""
     display = Display(CHANNEL, str(DBC))
     yield display
     display.close()

@@ -1,4 +1,7 @@
-"""The receiver under test: a display that shows a value while it is fresh, and dashes otherwise. Put your own in its place."""
+"""The receiver under test: a display that shows a value while it is fresh, and dashes otherwise.
+
+Replace it by your own receiver.
+"""
 
 import time
 
@@ -9,7 +12,7 @@ STALE_S = 0.5
 
 
 class Display:
-    """The newest value of each signal on a bus, by the gateway's DBC."""
+    """The newest value of each signal on a bus, decoded with the gateway's DBC."""
 
     def __init__(self, channel: str, dbc: str) -> None:
         self._database = cantools.database.load_file(dbc)
@@ -17,7 +20,10 @@ class Display:
         self._seen: dict[str, tuple[object, float]] = {}
 
     def shown(self, signal: str) -> object:
-        """Value in the DBC's unit or text of its table; None where it is not available, or no frame of it came for 0.5 s."""
+        """Return a value in the DBC's unit, or a text of its value table.
+
+        None: the value is not available, or no frame with it arrived for 0.5 s.
+        """
         self._receive()
         value, seen_s = self._seen.get(signal, (None, 0.0))
         if str(value) in ("NotAvailable", "Error") or time.monotonic() - seen_s > STALE_S:
@@ -33,8 +39,8 @@ class Display:
                 try:
                     message = self._database.get_message_by_frame_id(frame.arbitration_id)
                 except KeyError:
-                    continue  # of somebody else
+                    continue  # a frame of another device
                 for name, value in message.decode(frame.data).items():
-                    self._seen[name] = value, time.monotonic()
+                    self._seen[name] = (value, time.monotonic())
         except can.CanError:
-            return  # the interface is down; the socket is good again when it is up
+            return  # The interface is down. The socket works again when it is up.

@@ -33,8 +33,8 @@ class Emergencies:
     ``send`` is called with the COB-ID and the 8 bytes of each emergency.
 
     Emergencies are sent in the order in which the errors happened. After a hold-up of the process,
-    the loss of telemetry may be noticed before older frames are read. Emergencies are then delayed
-    until ``advance``, which the loop calls at the end of every turn.
+    the loss of telemetry may be noticed before older frames are read. So each loss of telemetry
+    delays emergencies until ``advance``, which the loop calls at the end of every turn.
     """
 
     def __init__(

@@ -36,7 +36,7 @@ def announced_config(with_nodes: bool = False) -> Path | None:
     found = default_config()
     if found is None or (with_nodes and not load(found).canopen.enabled):
         return None
-    say(f"by {found}")
+    say(f"using {found}")
     return found
 
 

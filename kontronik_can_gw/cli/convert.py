@@ -206,13 +206,13 @@ def _format(args: argparse.Namespace) -> str:
     if args.to:
         return str(args.to)
     if args.output == "-":
-        raise UserError(f"to standard output goes text: give --to: {', '.join(ON_SCREEN)}")
+        raise UserError(f"standard output takes only text. Give --to {' or '.join(ON_SCREEN)}.")
     suffix = Path(args.output).suffix.lower()
     if suffix == ".mf4":
         raise UserError(f"{args.output}: {REMOVED_OPTIONS['convert', '--to mf4']}")
     if suffix not in SUFFIXES:
         raise UserError(
-            f"{args.output}: its suffix tells no format. Give --to, or one of these suffixes: "
+            f"{args.output}: unknown suffix. Give --to, or one of these suffixes: "
             f"{' '.join(SUFFIXES)}"
         )
     return SUFFIXES[suffix]

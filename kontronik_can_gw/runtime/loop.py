@@ -280,7 +280,7 @@ class Loop:
         """
         text = (
             f"the process was suspended for {late / SECOND:.1f} s: "
-            "measurements that waited to be sent are dropped and made anew"
+            "measurements that waited to be sent are discarded and replaced by current ones"
         )
         self.conditions.event("suspended", text, now)
         self.gateway.held_up(now, self.can.transmitter.drop_measurements())

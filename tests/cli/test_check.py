@@ -74,14 +74,14 @@ def test_commands_report_the_configuration_that_they_found(places: tuple[Path, P
     assert run("dbc").err == ""
     written(own, f'{LEAST}name = "left"\n[[esc]]\nname = "right"\nport = "x"\n')
     done = run("dbc")
-    assert done.err.startswith("kontronik-can-gw: by gateway.toml\n")
+    assert done.err.startswith("kontronik-can-gw: using gateway.toml\n")
     assert "EscSpeed_right" in done.out or "right" in done.out.lower()
     assert run("dbc", "--esc", 1).err == ""
-    assert "by gateway.toml" in run("describe").err
+    assert "using gateway.toml" in run("describe").err
     assert run("eds").err == "", "no nodes in it"
     with own.open("a") as file:
         file.write('[canopen]\nenabled = true\n[statistics]\nfile = "state.json"\n')
-    assert "by gateway.toml" in run("eds").err
+    assert "using gateway.toml" in run("eds").err
     assert "run -c gateway.toml" in refused(3, "status")
 
 

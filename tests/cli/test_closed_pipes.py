@@ -13,7 +13,7 @@ import pytest
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 CLOSED = 141
 NOTES = (
-    b"kontronik-can-gw: by gateway.toml",
+    b"kontronik-can-gw: using gateway.toml",
     (
         b"kontronik-can-gw: the ESC and its faults are simulated; "
         b"the gateway and the monitor are the real ones"

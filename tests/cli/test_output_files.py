@@ -179,7 +179,7 @@ def test_a_full_disk_leaves_no_partly_written_file(
     monkeypatch.setattr(os, "fsync", full)
     for command in COMMANDS:
         done = run(*command.format(o="out").split())
-        said = [line for line in done.err.splitlines() if ": by gateway.toml" not in line]
+        said = [line for line in done.err.splitlines() if ": using gateway.toml" not in line]
         assert done.code == 1, done
         assert done.out == "", done
         assert len(said) == 1, done

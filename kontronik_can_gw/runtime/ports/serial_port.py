@@ -316,8 +316,8 @@ def _users_now_and_then(path: str) -> str:
 def _users(path: str) -> str:
     """Return the other programs that have the port open, as a text for a message.
 
-    Without root's rights only two kinds of users can be found: the kernel's console, and programs
-    whose controlling terminal is the port (a getty).
+    Without root's rights it finds only the kernel's console, programs whose controlling terminal is
+    the port (a getty), and programs of the same user.
     """
     device = device_of(path)
     found = set()
