@@ -92,9 +92,13 @@ vm_line="sudo apt-get install $vm_packages"
 # Programs that are installed already need no rights.
 # User Mode Linux 6.1 does not support the registers of the newest processors. It needs uml_xstate.c
 # to start there.
-install_uml() {
+uml_has_started() { # an earlier set-up has installed and tried User Mode Linux
     key=$(cksum <tests/vm/uml_xstate.c)
-    command -v linux.uml >/dev/null && [ "$(cat .venv/.uml-starts 2>/dev/null)" = "$key" ] && return
+    command -v linux.uml >/dev/null && [ "$(cat .venv/.uml-starts 2>/dev/null)" = "$key" ]
+}
+
+install_uml() {
+    uml_has_started && return
     for program in linux.uml busybox cc ip candump; do
         command -v $program >/dev/null && continue
         can_root || { lacking "$vm_packages" "a kernel with vcan"; return 1; }
@@ -120,6 +124,7 @@ install_vcan() {
         tests/vm/setup.sh || { say "failed; by hand:  $vm_line"; return; }
     fi
     has_vcan && return
+    uml_has_started && return
     extra=linux-modules-extra-$(uname -r) # Ubuntu's package with vcan
     if can_root && apt_update && apt-cache show "$extra" >/dev/null 2>&1; then
         say "$extra (vcan)"
@@ -159,6 +164,8 @@ install_small_tools() {
     install_programs "what screens, completion and benchmarks are tried with" tmux zsh openssl jq
 }
 
+install_cpp() { install_programs "a C++ compiler" g++; }
+
 install_clang() { install_programs "a second C compiler, with a fuzzer" clang=clang,libclang-rt-dev; }
 
 install_browser() { command -v google-chrome >/dev/null || install_programs "a browser" chromium; }
@@ -194,7 +201,7 @@ install_cross_compilers() {
 case $what in
     demo) install_project demo . ;;
     lint) install_project test '.[test]' ;;
-    test) install_compiler; install_project test '.[test]'; install_vcan; install_small_tools ;;
+    test) install_compiler; install_project test '.[test]'; install_vcan; install_small_tools; install_cpp ;;
     test-all)
         install_compiler
         # This needs a minute of processor time besides the downloads. The call below reports failures.
@@ -202,6 +209,7 @@ case $what in
         install_project test '.[test]'
         install_vcan
         install_small_tools
+        install_cpp
         install_vm uml
         install_browser
         install_clang

@@ -22,7 +22,7 @@ def there(program: str | None = None) -> str:
     """Return a compiler, by default the machine's. Skip the test if it is missing."""
     found = compiler() if program is None else shutil.which(program)
     if found is None:
-        pytest.skip("no C compiler: sudo apt-get install gcc libc6-dev clang")
+        pytest.skip(f"no {program or 'cc'}: sudo apt-get install {program or 'gcc'} libc6-dev")
     return found
 
 

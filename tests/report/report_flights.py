@@ -25,8 +25,11 @@ Row = tuple[int, list[Value]]
 
 
 def simulated(bus: BusLayout, seconds: float, options: Sequence[EscOptions] = ()) -> Iterator[Row]:
-    """Yield the rows of simulated ESCs, whose values pass the real gateway, the bus and the DBC."""
-    given = list(options)
+    """Yield the rows of simulated ESCs, whose values pass the real gateway, the bus and the DBC.
+
+    Further options than ESCs are not used.
+    """
+    given = list(options)[: len(bus.escs)]
     while len(given) < len(bus.escs):
         given.append(EscOptions())
     reader = SignalReader(bus.layout)
