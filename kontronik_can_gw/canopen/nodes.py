@@ -314,7 +314,7 @@ def nodes_alone(
 
     ``message_ids`` are the 11-bit ids that messages use, with their names.
     """
-    core = PythonCore(escs, Layout("", "", ()), 0, silent=False)
+    core = PythonCore(escs, Layout("", "", ()), 0, silent_on_loss=False)
     core.own_ids = {can_id: Owner(None, name) for can_id, name in message_ids.items()}
     return Nodes(setups, core)
 

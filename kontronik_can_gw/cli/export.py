@@ -42,10 +42,10 @@ def main(args: argparse.Namespace) -> int:
     """Write the folder. Raises UserError for faulty input files, RunError if writing fails."""
     folder = Path(output_of(args, "DIR"))
     bus = bus_layout(args)
-    silent = bus.config is not None and bus.config.dbc.silent_on_loss
+    silent_on_loss = bus.config is not None and bus.config.dbc.silent_on_loss
     licence = shipped("LICENSE").read_text(encoding="utf-8")
     try:
-        files = exported(bus.layout, bus.escs, silent, licence)
+        files = exported(bus.layout, bus.escs, silent_on_loss, licence)
     except NotInCore as error:
         raise UserError(f"{bus.layout.file}: not in the core in C: {error}") from None
     if bus.config is not None and bus.config.canopen.enabled:

@@ -33,7 +33,7 @@ def in_words(config: Config, folder: Path) -> str:
 
 
 def recorded(
-    loaded: Loaded, given: Path | None, now: int, silent: bool
+    loaded: Loaded, given: Path | None, now: int, silent_on_loss: bool
 ) -> tuple[Gateway, Recorder]:
     """Return the gateway of a configuration and its recorder.
 
@@ -43,7 +43,9 @@ def recorded(
     assert folder is not None
     recorder = Recorder(folder, loaded.config.record)
     recorder.words = in_words(loaded.config, folder)
-    gateway = RecordedGateway(recorder.put, loaded.escs, loaded.layout, now, silent, loaded.outputs)
+    gateway = RecordedGateway(
+        recorder.put, loaded.escs, loaded.layout, now, silent_on_loss, loaded.outputs
+    )
     known = {
         "created_ns": now,
         "state": state_of(gateway),

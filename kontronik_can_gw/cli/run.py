@@ -161,14 +161,14 @@ class _Run:
         """
         config = loaded.config
         now = time.monotonic_ns()
-        silent = config.dbc.silent_on_loss
+        silent_on_loss = config.dbc.silent_on_loss
         if self._args.record is not None or config.record.directory is not None:
             from kontronik_can_gw.cli.recording import recorded
 
-            return recorded(loaded, self._args.record, now, silent)
+            return recorded(loaded, self._args.record, now, silent_on_loss)
         from kontronik_can_gw.gateway.gateway import Gateway
 
-        return Gateway(loaded.escs, loaded.layout, now, silent, loaded.outputs), None
+        return Gateway(loaded.escs, loaded.layout, now, silent_on_loss, loaded.outputs), None
 
 
 def _begin_realtime(priority: int | None, wait: bool) -> None:

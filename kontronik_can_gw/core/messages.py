@@ -34,15 +34,17 @@ _EVENT_OF_PACE = {
 class Traits:
     """How a message is sent, according to its plan. The core in C is given the same."""
 
-    def __init__(self, plan: MessagePlan, silent: bool) -> None:
+    def __init__(self, plan: MessagePlan, silent_on_loss: bool) -> None:
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         self.is_paged = len(plan.pages) > 1
         # Without a cycle, a minimum distance and further pages, time never makes it pending.
         self.is_untimed = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
         # Messages with the state of the link are always sent.
-        self.silent_able = (
-            silent and bool(plan.paces & {Group.LIVE, Group.INFO}) and Group.LINK not in plan.paces
+        self.is_silent_on_loss = (
+            silent_on_loss
+            and bool(plan.paces & {Group.LIVE, Group.INFO})
+            and Group.LINK not in plan.paces
         )
         self.follows_gateway = Group.GATEWAY in plan.paces and (self.by_event or self.on_change)
         roles = {signal.role: signal for signal in plan.compiled}
@@ -77,8 +79,10 @@ def phases(cycles: Sequence[int]) -> list[int]:
 class _Message(Traits):
     """The state of one message."""
 
-    def __init__(self, index: int, plan: MessagePlan, silent: bool, first_cycle: int) -> None:
-        super().__init__(plan, silent)
+    def __init__(
+        self, index: int, plan: MessagePlan, silent_on_loss: bool, first_cycle: int
+    ) -> None:
+        super().__init__(plan, silent_on_loss)
         self.index = index
         self.plan = plan
         self.frame = compile_frame(plan)
@@ -186,8 +190,8 @@ def own_ids(layout: Layout) -> dict[int, Owner]:
 class Messages:
     """All messages of one layout.
 
-    With ``silent``, messages with values of ESCs stop when the telemetry of all these ESCs is lost.
-    Otherwise they are sent with NotAvailable.
+    With ``silent_on_loss``, messages with values of ESCs stop when the telemetry of all these ESCs
+    is lost. Otherwise they are sent with NotAvailable.
     """
 
     def __init__(
@@ -196,13 +200,13 @@ class Messages:
         escs: Sequence[EscTelemetry],
         gateway: GatewayStatus,
         now: int,
-        silent: bool = False,
+        silent_on_loss: bool = False,
     ) -> None:
         self._escs = escs
         self._gateway = gateway
         first = phases([plan.cycle_ns for plan in layout.messages])
         self._messages = [
-            _Message(index, plan, silent, now + phase)
+            _Message(index, plan, silent_on_loss, now + phase)
             for index, (plan, phase) in enumerate(zip(layout.messages, first, strict=True))
         ]
         self._of_gateway = [m for m in self._messages if m.follows_gateway]
@@ -301,7 +305,7 @@ class Messages:
 
         They are the changed ones if it was requested, and the next one if its cycle is over.
         """
-        if message.silent_able and not any(self._escs[esc].up for esc in message.plan.escs):
+        if message.is_silent_on_loss and not any(self._escs[esc].up for esc in message.plan.escs):
             message.pages_to_send.clear()
             return False
         is_news = bool(why & _REQUEST) and self._note_news(message, now)

@@ -17,7 +17,7 @@ from kontronik_can_gw.times import SECOND
 class PythonCore:
     """The core in plain Python. See ``core.interface.Core`` for its methods.
 
-    With ``silent``, messages stop while telemetry is lost (``core.messages.Messages``).
+    With ``silent_on_loss``, messages stop while telemetry is lost (``core.messages.Messages``).
     """
 
     language = "Python"
@@ -28,11 +28,11 @@ class PythonCore:
         escs: Sequence[EscSettings],
         layout: Layout,
         now: int,
-        silent: bool,
+        silent_on_loss: bool,
     ) -> None:
         self.escs: list[EscStream] = [EscStream(settings, now) for settings in escs]
         self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
-        self.messages = Messages(layout, self.escs, self.status, now, silent)
+        self.messages = Messages(layout, self.escs, self.status, now, silent_on_loss)
         self.slots = Slots(self.escs, self.status)
         self.slot = self.slots.add
         self.own_ids = own_ids(layout)

@@ -231,10 +231,10 @@ def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
     return None
 
 
-def unreported(layout: Layout, silent: bool) -> list[str]:
+def unreported(layout: Layout, silent_on_loss: bool) -> list[str]:
     """Return a warning for each message whose flags hide the loss of telemetry.
 
-    ``silent`` is True if ``dbc.on_loss`` is "silent".
+    ``silent_on_loss`` is True if ``dbc.on_loss`` is "silent".
     """
     found = []
     for message in layout.messages:
@@ -244,7 +244,7 @@ def unreported(layout: Layout, silent: bool) -> list[str]:
         for signal in message.signals:
             if is_mute(signal) and reporter(message, signal) is None:
                 flags.append(signal.name)
-        if flags and not (silent and stops):
+        if flags and not (silent_on_loss and stops):
             remedy = ', or set dbc.on_loss = "silent"' if stops else ""
             found.append(
                 f"{layout.file}: {message.name}: without telemetry {listed(flags, 3)} are sent "

@@ -1225,7 +1225,7 @@ static void advance_messages(kcg *g, int64_t now)
 /* Returns 1 if a message is not sent because all of its ESCs are without live data. */
 static int is_silent(const kcg *g, const kcg_message *m)
 {
-    if (!(m->flags & KCG_SILENT))
+    if (!(m->flags & KCG_SILENT_ON_LOSS))
         return 0;
     for (uint32_t k = 0; k < m->escs; k++)
         if (g->esc[g->plan->esc_of[m->first_esc + k]].has_live)

@@ -162,7 +162,7 @@ enum {
 enum {
     KCG_EVENT = 1,           /* Sent with each event in `triggers`. */
     KCG_ON_CHANGE = 2,       /* Sent with these events if its content has changed. */
-    KCG_SILENT = 4,          /* Not sent while all of its ESCs are without live data. */
+    KCG_SILENT_ON_LOSS = 4,  /* Not sent while all of its ESCs are without live data. */
     KCG_HAS_CRC = 8,         /* Has the CRC of AUTOSAR E2E profile 1 at byte `crc_at`. */
     KCG_OF_THE_GATEWAY = 16, /* Has values of the gateway, and is sent by kcg_gateway_changed. */
     KCG_FREE = 32,           /* Has neither cycle nor minimum distance, and one page. */
@@ -171,9 +171,11 @@ enum {
        `cycle` without an event. The period on average is their mean. */
     KCG_PACED = 128
 };
-/* kcg_frame.page of the frames of transfers: from KCG_FIRST_PART on, each KCG_PARTS numbers belong
-   to one transfer. */
-enum { KCG_FIRST_PART = KCG_PAGES, KCG_PARTS = 3 };
+/* kcg_frame.page of the frames of transfers. */
+enum {
+    KCG_FIRST_PART = KCG_PAGES, /* The first page of a transfer. */
+    KCG_PARTS = 3               /* Consecutive pages of one transfer. */
+};
 
 /* A part of a signal in a frame: `width` bits of the raw value from bit `shift` on, at bit `at` of
    the frame. It does not cross a border of 64 bits. */

@@ -73,10 +73,10 @@ class NativeCore:
         escs: Sequence[EscSettings],
         layout: Layout,
         now: int,
-        silent: bool,
+        silent_on_loss: bool,
         slots: int = 0,
     ) -> None:
-        tables = Tables(layout, escs, silent)
+        tables = Tables(layout, escs, silent_on_loss)
         self._places = reserve(tables, slots)
         self.slots_of_esc = len(self._places[0])
         self.library = library

@@ -29,13 +29,13 @@ _WIDTH = 118
 
 
 def exported(
-    layout: Layout, escs: Sequence[EscSettings], silent: bool, licence: str
+    layout: Layout, escs: Sequence[EscSettings], silent_on_loss: bool, licence: str
 ) -> dict[str, str]:
     """Return the text of each file by its name.
 
     Raises NotInCore if the core in C cannot express the layout or an ESC's settings.
     """
-    tables = Tables(layout, escs, silent)
+    tables = Tables(layout, escs, silent_on_loss)
     core_c = (FOLDER / "core.c").read_text(encoding="utf-8")
     core_h = (FOLDER / "core.h").read_text(encoding="utf-8")
     for name, value in _options(layout, tables).items():

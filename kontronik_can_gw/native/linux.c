@@ -23,7 +23,10 @@
 #define MAX_FULL (250 * MS)    /* The loop handles a bus that has been full for this long. */
 #define MAX_UNPOLLED (10 * MS) /* Saves polls: values of quiet ports may appear older by this. */
 #define CHECK_EACH (100 * MS)  /* Between checks of settings: an echo would send to the ESC. */
-enum { CLASSIC_SIZE = 16, FD_SIZE = 72 }; /* Size of struct can_frame and struct canfd_frame. */
+enum {
+    CLASSIC_SIZE = 16, /* Size of struct can_frame. */
+    FD_SIZE = 72       /* Size of struct canfd_frame. */
+};
 
 static int64_t now_ns(void)
 {

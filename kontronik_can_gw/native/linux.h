@@ -14,7 +14,11 @@ enum {
     KCG_AT_ONCE = 64,   /* Ports served in one turn; frames given to the kernel in one call. */
     KCG_SETTINGS = 64   /* Bytes of a copy of struct termios. */
 };
-enum { KCG_NOTE_BYTES = 1, KCG_NOTE_ADVANCE = 3 }; /* Kinds of entries (capture/format.py, Kind). */
+/* Kinds of entries (capture/format.py, Kind). */
+enum {
+    KCG_NOTE_BYTES = 1,
+    KCG_NOTE_ADVANCE = 3
+};
 
 #define KCG_OUTPUTS (1 << 29)          /* An event: let time pass for the outputs. */
 #define KCG_DRAINED (INT64_C(1) << 62) /* As NEVER in times.py. */

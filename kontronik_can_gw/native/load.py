@@ -45,7 +45,7 @@ def make_core(
     escs: Sequence[EscSettings],
     layout: Layout,
     now: int,
-    silent: bool,
+    silent_on_loss: bool,
     slots: int = 0,
 ) -> Made:
     """Return the core for these ESCs and this layout.
@@ -58,10 +58,10 @@ def make_core(
         from kontronik_can_gw.native.rows import NotInCore
 
         try:
-            return Made(NativeCore(found, escs, layout, now, silent, slots), "")
+            return Made(NativeCore(found, escs, layout, now, silent_on_loss, slots), "")
         except NotInCore as error:
             why = str(error)
-    return Made(PythonCore(escs, layout, now, silent), why)
+    return Made(PythonCore(escs, layout, now, silent_on_loss), why)
 
 
 def give_back() -> None:

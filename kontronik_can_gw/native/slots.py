@@ -106,7 +106,7 @@ def write_message(message: Any, settings: SlotSettings, signals: int) -> None:
     message.id = settings.can_id | (EXTENDED if is_transfer else 0)
     message.length = plan.message.length
     message.words = 2 if plan.message.length > 8 else 1
-    flags = KCG.EVENT * settings.by_event | KCG.SILENT * plan.needs_live
+    flags = KCG.EVENT * settings.by_event | KCG.SILENT_ON_LOSS * plan.needs_live
     message.flags = flags | KCG.TRANSFER * is_transfer | KCG.PACED * plan.paced
     message.triggers = plan.triggers
     message.signals = signals

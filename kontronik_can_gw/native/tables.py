@@ -53,7 +53,9 @@ _M64 = (1 << 64) - 1
 class Tables:
     """The tables of the core for a layout."""
 
-    def __init__(self, layout: Layout, escs: Sequence[EscSettings], silent: bool = False) -> None:
+    def __init__(
+        self, layout: Layout, escs: Sequence[EscSettings], silent_on_loss: bool = False
+    ) -> None:
         self._plans = layout.messages
         self.signals = Rows(Signal)
         self.messages = Rows(Message)
@@ -77,7 +79,7 @@ class Tables:
             longest = max(plan.cycle_ns, plan.delay_ns)
             if longest >= END_OF_TIME:
                 raise NotInCore(f"{plan.name}: a cycle or distance of {longest} ns")
-            self._add(plan, silent, starts[index])
+            self._add(plan, silent_on_loss, starts[index])
             for esc in plan.escs:
                 if self.messages[-1].triggers:
                     self.listeners_of[esc].append(index)
@@ -132,13 +134,13 @@ class Tables:
             "slots": slots,
         }
 
-    def _add(self, plan: MessagePlan, silent: bool, phase: int) -> None:
+    def _add(self, plan: MessagePlan, silent_on_loss: bool, phase: int) -> None:
         crc = next((s for s in plan.compiled if s.role is Role.CRC), None)
-        traits = Traits(plan, silent)
+        traits = Traits(plan, silent_on_loss)
         flags = KCG.EVENT * traits.by_event
         flags |= KCG.ON_CHANGE * traits.on_change
         flags |= KCG.HAS_CRC * (crc is not None)
-        flags |= KCG.SILENT * traits.silent_able
+        flags |= KCG.SILENT_ON_LOSS * traits.is_silent_on_loss
         flags |= KCG.OF_THE_GATEWAY * traits.follows_gateway
         flags |= KCG.FREE * traits.is_untimed
         first_signal = len(self.signals)

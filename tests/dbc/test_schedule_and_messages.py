@@ -38,7 +38,7 @@ class Bench:
         self,
         messages: Sequence[tuple[Msg, int, int, int]],
         names: Sequence[str] = ("esc1",),
-        silent: bool = False,
+        silent_on_loss: bool = False,
         start: bool = False,
     ) -> None:
         attributes = []
@@ -51,7 +51,7 @@ class Bench:
         text = dbc_text([message for message, *_ in messages], "\n".join(attributes))
         layout = compiled(text, names)
         escs = [EscSettings(name, 7) for name in names]
-        self.gateway = Gateway(escs, layout, 0, silent)
+        self.gateway = Gateway(escs, layout, 0, silent_on_loss)
         self.now = 0
         self.sent: list[tuple[int, CanFrame]] = []
         if start:
@@ -363,13 +363,13 @@ def test_silent_stops_messages_with_values_but_not_the_link_status() -> None:
         status = Msg(f"EscLink{n}", 0x200 + n, 8, link)
         messages.append((values, kind, cycle, 0))
         messages.append((status, kind, cycle, 0))
-    for silent in (False, True):
-        bench = Bench(messages, silent=silent, start=True)
+    for silent_on_loss in (False, True):
+        bench = Bench(messages, silent_on_loss=silent_on_loss, start=True)
         bench.feed(500 * MS)
         bench.until(500 * MS + TIMEOUT)
         bench.forget()
         bench.until(3 * SECOND)
-        assert any(frame.can_id < 0x200 for _, frame in bench.sent) != silent
+        assert any(frame.can_id < 0x200 for _, frame in bench.sent) != silent_on_loss
         for n, (_, cycle) in enumerate(kinds):
             sent = [frame.data for _, frame in bench.sent if frame.can_id == 0x200 + n]
             assert sent[-1][0] == 4  # Lost
@@ -384,7 +384,7 @@ def test_silent_stops_messages_with_values_but_not_the_link_status() -> None:
 def test_silent_sends_a_message_of_several_escs_while_one_is_up() -> None:
     signals = [Sig("LeftBatteryVoltage", 0, 16), Sig("RightBatteryVoltage", 16, 16)]
     both = Msg("Both", 0x100, 8, signals)
-    bench = Bench([(both, CYCLIC, 50, 0)], ("left", "right"), silent=True)
+    bench = Bench([(both, CYCLIC, 50, 0)], ("left", "right"), silent_on_loss=True)
     bench.live(esc=0)
     bench.feed(400 * MS)
     assert bench.raws(16, 16) == [65535] * 9

@@ -77,8 +77,8 @@ class Drive:
         folder = f"{file.parent}/"
         warnings = [*loaded.layout.warnings, *loaded.warnings]
         self.warnings = [line.replace(folder, "") for line in warnings]
-        silent = loaded.config.dbc.silent_on_loss
-        self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent, loaded.outputs)
+        silent_on_loss = loaded.config.dbc.silent_on_loss
+        self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent_on_loss, loaded.outputs)
         self._waiting = TransmitQueue()
         self._open = True
         self._now = 0

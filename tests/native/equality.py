@@ -346,10 +346,10 @@ class Both:
         self.chance = chance
         self.escs = escs
         self.layout = layout
-        self.silent = chance.random() < 0.3
+        self.silent_on_loss = chance.random() < 0.3
         self.now = START
         self.events: tuple[list[Any], list[Any]] = ([], [])
-        given = self.escs, self.layout, self.now, self.silent
+        given = self.escs, self.layout, self.now, self.silent_on_loss
         self.python = PythonCore(*given)
         slots = chance.choice((0, 1, 3))
         self.native = NativeCore(library, *given, slots)

@@ -35,13 +35,13 @@ class Case:
     ) -> None:
         chance = random.Random(seed)
         self.folder = folder
-        self.silent = chance.random() < 0.3
+        self.silent_on_loss = chance.random() < 0.3
         while True:
             self.escs = escs or equality.some_escs(chance)
             self.layout = layout or equality.layout(chance, self.escs)
             try:
                 licence = shipped("LICENSE").read_text(encoding="utf-8")
-                files = exported(self.layout, self.escs, self.silent, licence)
+                files = exported(self.layout, self.escs, self.silent_on_loss, licence)
                 break
             except NotInCore:
                 assert layout is None
@@ -93,7 +93,7 @@ class Case:
 
     def expected(self) -> str:
         """Return the frames of the Python core with the same clock, in the format of candump."""
-        core = PythonCore(self.escs, self.layout, 0, self.silent)
+        core = PythonCore(self.escs, self.layout, 0, self.silent_on_loss)
         core.status.state = GatewayState.RUNNING
         core.status.can_state = CanState.ERROR_ACTIVE
         core.repeat(0)
