@@ -74,8 +74,9 @@ _LAYOUT_TOKENS = {
     tokenize.ENCODING,
     tokenize.ENDMARKER,
 }
-_FSTRING_PARTS = {"FSTRING_MIDDLE", "FSTRING_END"}
-"""Python 3.12 splits an f-string into several tokens. Only its start is counted."""
+_FSTRING_START = "FSTRING_START"
+_FSTRING_END = "FSTRING_END"
+"""Python 3.12 splits an f-string into several tokens. It is counted as one, as in Python 3.11."""
 
 
 @dataclass
@@ -196,7 +197,16 @@ def _count_python(source: str, measure: Measure) -> list[tuple[int, str]]:
     prose: list[tuple[int, str]] = []
     code_lines: set[int] = set()
     is_statement_start = True
+    fstring_depth = 0
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        name = tokenize.tok_name[token.type]
+        if name == _FSTRING_END:
+            fstring_depth -= 1
+        is_inside_fstring = fstring_depth > 0 or name == _FSTRING_END
+        if name == _FSTRING_START:
+            fstring_depth += 1
+        if is_inside_fstring:
+            continue
         if token.type == tokenize.COMMENT:
             prose.append((token.start[0], token.string.lstrip("#:! ")))
         elif token.type in _LAYOUT_TOKENS:
@@ -207,8 +217,7 @@ def _count_python(source: str, measure: Measure) -> list[tuple[int, str]]:
             prose += enumerate(parts, token.start[0])
             is_statement_start = False
         else:
-            if tokenize.tok_name[token.type] not in _FSTRING_PARTS:
-                measure.tokens += 1
+            measure.tokens += 1
             code_lines.add(token.start[0])
             is_statement_start = False
     measure.code_lines = len(code_lines)
