@@ -13,7 +13,6 @@ from kontronik_can_gw.cli.output import check_output, writing
 from kontronik_can_gw.desk.pty import run
 from kontronik_can_gw.errors import RunError, UserError, did_you_mean
 from kontronik_can_gw.esc.kontronik.simulator import (
-    SECOND_NS,
     Device,
     Dropout,
     ErrorWindow,
@@ -24,6 +23,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     SelfTestError,
     SimulatedEsc,
 )
+from kontronik_can_gw.times import SECOND
 
 _DEVICES = {device.text.lower(): device for device in Device}
 _BITS: dict[str, OperatingError | SelfTestError] = {}
@@ -179,7 +179,7 @@ def _to_files(escs: list[SimulatedEsc], output: str, time_ns: int, *, force: boo
             now = esc.next_ns
             end = now + time_ns
             while now < end:  # steps of a minute limit the memory, even for a year
-                now = min(now + 60 * SECOND_NS, end)
+                now = min(now + 60 * SECOND, end)
                 for sent in esc.frames_until(now - 1):
                     file.write(sent.wire)
                     total += len(sent.wire)
@@ -207,7 +207,7 @@ def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | Non
 
         run(
             list(zip(escs, opened, strict=True)),
-            seconds=None if time_ns is None else time_ns / SECOND_NS,
+            seconds=None if time_ns is None else time_ns / SECOND,
             stop=stop.is_set,
             on_received=complain,
         )

@@ -16,12 +16,11 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.signals.packer import alive_modulus, compile_frame
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
 from kontronik_can_gw.status import GatewayStatus
-from kontronik_can_gw.times import NEVER
+from kontronik_can_gw.times import MS, NEVER
 
-_LONG_AGO = -(1 << 62)
 _CYCLE, _REQUEST = 1, 2
 """Why a message is pending. It is always sent for its cycle, and for a request if it has news."""
-_MIN_DISTANCE_NS = 1_000_000
+_MIN_DISTANCE_NS = MS
 """Minimum distance between frames of a message that are not caused by an event."""
 _EVENT_OF_PACE = {
     Group.LIVE: Event.LIVE,
@@ -93,7 +92,7 @@ class _Message(Traits):
         self.last: dict[int, CanFrame] = {}
         """If it is sent on change: the last frame of each page, with alive counter 0."""
         self.why = 0
-        self._sent_ns = _LONG_AGO
+        self._sent_ns = -NEVER
         self._cycle_due = first_cycle if plan.cycle_ns else NEVER
         self._deferred_until = NEVER
         self._cycle_deferred = False

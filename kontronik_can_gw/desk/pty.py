@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Self
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, SimulatedEsc
+from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
+from kontronik_can_gw.times import SECOND
 
 
 class PtyEsc:
@@ -120,7 +121,7 @@ def run(
     ``on_received`` gets the index of an ESC that received bytes.
     """
     origin_ns = time.monotonic_ns()
-    end_ns = None if seconds is None else round(seconds * SECOND_NS)
+    end_ns = None if seconds is None else round(seconds * SECOND)
     poller = select.poll()
     index_of = {}
     for index, (_, terminal) in enumerate(escs):
@@ -139,8 +140,8 @@ def run(
                 _send_frames(esc, terminal, now_ns)
         # Waits for at least 1 ms, so that frames due within it share a round. 64 ESCs then need no
         # more rounds than 10.
-        due_ns = min((esc.next_ns for esc, _ in escs), default=now_ns + SECOND_NS)
-        until_ns = min(due_ns, now_ns + SECOND_NS // 10)
+        due_ns = min((esc.next_ns for esc, _ in escs), default=now_ns + SECOND)
+        until_ns = min(due_ns, now_ns + SECOND // 10)
         if end_ns is not None:
             until_ns = min(until_ns, end_ns)
         wait_ms = 0.0 if is_last_round else max((until_ns - now_ns) / 1e6, 1)

@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, Self
 
-from kontronik_can_gw.esc.decoder import SECOND_NS, Counters, Data, EscProtocol
+from kontronik_can_gw.esc.decoder import Counters, Data, EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, LinkState
 from kontronik_can_gw.native.rows import COUNTS, GATEWAY
 from kontronik_can_gw.status import CanState, GatewayState
+from kontronik_can_gw.times import SECOND
 
 _STREAM = COUNTS.index("longer_crcs") + 1
 """Number of entries in kcg_esc.count that count the stream. They are at the beginning."""
@@ -99,11 +100,11 @@ for _name, _read in _READ.items():
 
 
 def _energy(esc: NativeEsc) -> int:
-    return int(esc._state.energy) * SECOND_NS + int(esc._state.energy_rest)
+    return int(esc._state.energy) * SECOND + int(esc._state.energy_rest)
 
 
 def _set_energy(esc: NativeEsc, mw_ns: int) -> None:
-    esc._state.energy, esc._state.energy_rest = divmod(mw_ns, SECOND_NS)
+    esc._state.energy, esc._state.energy_rest = divmod(mw_ns, SECOND)
 
 
 def _set_run_time(esc: NativeEsc, ns: int) -> None:

@@ -18,16 +18,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 
 from kontronik_can_gw.desk.recordings.recording import ClockStep, LogFrame
+from kontronik_can_gw.times import SECOND
 
-SECOND_NS = 1_000_000_000
 _DISORDER_NS = 100_000_000
 """Frames of several interfaces may be this far out of order."""
 _STEP_FRAMES = 10
 """Frames in a row that must agree on a step back."""
-_FAR_NS = 10 * SECOND_NS
+_FAR_NS = 10 * SECOND
 """A single frame that is farther away than this from its neighbours has a damaged time."""
-_DAY_NS = 86_400 * SECOND_NS
-_LONE_NS = SECOND_NS
+_DAY_NS = 86_400 * SECOND
+_LONE_NS = SECOND
 """A single frame this far ahead does not count if the next frame has an earlier time."""
 _REMEMBERED = 256
 """Frames in which the periods of the ids are looked up."""

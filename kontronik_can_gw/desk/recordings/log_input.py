@@ -25,6 +25,7 @@ from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.times import SECOND
 
 _BATCH = 256
 """Number of frames in a batch."""
@@ -168,7 +169,7 @@ class CanLogInput(Input):
         before = None
         try:
             for item in clock.frames():
-                if before is None and item.time_ns >= text.OLDEST_WALL_S * text.SECOND_NS:
+                if before is None and item.time_ns >= text.OLDEST_WALL_S * SECOND:
                     self._reader.wall_start_ns = 0  # Unix times, even if the head has another start
                 if item.channel != before:
                     before = item.channel

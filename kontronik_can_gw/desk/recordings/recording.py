@@ -18,6 +18,7 @@ from kontronik_can_gw.desk.words import duration
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
+from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.native.offline import Frames, Rows
@@ -32,7 +33,7 @@ ROWS = 512
 """Number of rows in a block that Python makes. Longer blocks are slower: they exceed the cache."""
 _LISTED_STEPS = 3
 """Number of clock steps that are listed."""
-_DISORDER_NS = 1_000_000_000
+_DISORDER_NS = SECOND
 """Frames of several interfaces may be this far out of order."""
 
 

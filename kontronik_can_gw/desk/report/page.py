@@ -21,7 +21,7 @@ from kontronik_can_gw.desk.report.quantities import PHASES, PLOTS, Plot
 from kontronik_can_gw.desk.report.summary import tables, tiles
 from kontronik_can_gw.desk.words import clock, duration, number, wall_clock
 from kontronik_can_gw.esc.values import VALUES
-from kontronik_can_gw.times import SECOND
+from kontronik_can_gw.times import MS, SECOND
 
 HERE = Path(__file__).parent
 _MAX_CUTS = 20
@@ -95,7 +95,7 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
         "escs": [esc.name for esc in flight.escs],
         "from": seconds(flight.start_ns),
         "to": seconds(flight.end_ns),
-        "wall": None if wall_ns is None else wall_ns // 1_000_000,
+        "wall": None if wall_ns is None else wall_ns // MS,
         "cuts": [[seconds(cut.begin_ns), cut.length_ns / SECOND] for cut in flight.cuts],
         "times": [seconds(time_ns) for time_ns in flight.points.times],
         "phases": PHASES,

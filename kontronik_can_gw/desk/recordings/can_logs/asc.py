@@ -9,7 +9,6 @@ from datetime import datetime
 
 from kontronik_can_gw.desk.recordings.can_logs.text import (
     OLDEST_WALL_S,
-    SECOND_NS,
     TextReader,
     checked,
     error_frame,
@@ -18,6 +17,7 @@ from kontronik_can_gw.desk.recordings.can_logs.text import (
 )
 from kontronik_can_gw.desk.recordings.recording import LogFrame
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.times import SECOND
 
 _DIRECTIONS = (b"rx", b"tx", b"txrq")
 _REQUEST = b"txrq"
@@ -70,7 +70,7 @@ class AscReader(TextReader):
         if found is not None and not self._relative:
             began = _time_zero(began, written or began, float(found["time"]))
         start_ns = _unix_ns(began)
-        if start_ns >= OLDEST_WALL_S * SECOND_NS:
+        if start_ns >= OLDEST_WALL_S * SECOND:
             self.wall_start_ns = start_ns
 
     def _frame(self, line: bytes) -> LogFrame | None:
@@ -174,7 +174,7 @@ def asc_time(words: list[str]) -> _Moment | None:
 
 def _unix_ns(started: _Moment) -> int:
     moment, fraction_ns = started
-    return int(moment.timestamp()) * SECOND_NS + fraction_ns
+    return int(moment.timestamp()) * SECOND + fraction_ns
 
 
 def _time_zero(began: _Moment, written: _Moment, first_s: float) -> _Moment:

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.recordings.can_logs.text import (
     OLDEST_WALL_S,
-    SECOND_NS,
     LogReader,
     frame_of,
 )
 from kontronik_can_gw.desk.recordings.recording import LogFrame
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.light_imports import without_asammdf
+from kontronik_can_gw.times import MS, SECOND
 
 with without_asammdf():
     from can import BLFReader
@@ -43,7 +43,6 @@ _ERROR_OBJECTS = tuple(number.to_bytes(4, "little") for number in (2, 104))
 _STEP_FRAMES = 10
 _STEP_S = 0.1
 """The same limits as in log_clock.py."""
-_MS = 1_000_000
 
 
 class LibraryReader(LogReader):
@@ -127,7 +126,7 @@ class BlfReader(LibraryReader):
             if problem:
                 self.damage.append(problem)
         if reader.start_timestamp >= OLDEST_WALL_S:
-            self.wall_start_ns = round(reader.start_timestamp * 1000) * _MS
+            self.wall_start_ns = round(reader.start_timestamp * 1000) * MS
         reader.start_timestamp = 0.0
 
     def __iter__(self) -> Iterator[LogFrame]:
@@ -177,9 +176,9 @@ class Mf4Reader(LibraryReader):
             )
         if start_s >= OLDEST_WALL_S:
             # asammdf converts local times, but only ``abs_time`` has the exact fraction of a second
-            fraction_ns = int(reader._mdf.header.abs_time) % SECOND_NS
-            whole_s = round(start_s - fraction_ns / SECOND_NS)
-            self.wall_start_ns = whole_s * SECOND_NS + fraction_ns
+            fraction_ns = int(reader._mdf.header.abs_time) % SECOND
+            whole_s = round(start_s - fraction_ns / SECOND)
+            self.wall_start_ns = whole_s * SECOND + fraction_ns
         reader._start_timestamp = 0.0
 
     def close(self) -> None:

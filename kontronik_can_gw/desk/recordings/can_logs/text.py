@@ -15,8 +15,8 @@ from typing import Any, BinaryIO
 from kontronik_can_gw.desk.recordings.recording import ERROR, LATEST_NS, LogFrame
 from kontronik_can_gw.frames import MAX_EXTENDED_ID, CanFrame
 from kontronik_can_gw.light_imports import without_asammdf
+from kontronik_can_gw.times import SECOND
 
-SECOND_NS = 1_000_000_000
 OLDEST_WALL_S = 631_152_000
 """1990. Earlier times are not Unix times, but seconds since a start."""
 MAX_S = 1 << 31
@@ -73,7 +73,7 @@ def frame_of(message: Any, first_channel: int = 0) -> LogFrame:
         if len(data) != size or (dlc > 15 and not message.is_fd):
             raise ValueError
         frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
-    time_ns = round(message.timestamp * SECOND_NS)
+    time_ns = round(message.timestamp * SECOND)
     if abs(message.timestamp) >= _EXACT_S:
         time_ns = round(time_ns, -3)
     channel = "1" if message.channel is None else str(message.channel + first_channel)

@@ -12,16 +12,15 @@ from datetime import UTC, datetime, timedelta
 from typing import IO, TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.desk.recordings.can_logs.channels import Channels
-from kontronik_can_gw.desk.recordings.can_logs.text import SECOND_NS
 from kontronik_can_gw.desk.recordings.recording import ERROR, LogFrame
 from kontronik_can_gw.light_imports import without_asammdf
+from kontronik_can_gw.times import MS, SECOND
 
 if TYPE_CHECKING:
     from can import Message
 
     from kontronik_can_gw.desk.recordings.recording import Batch
 
-_MS = 1_000_000
 _LATEST_NS = 1 << 61
 """Latest time that the C core writes as text."""
 _DIRECTIONS = {True: " R", False: " T", None: ""}
@@ -60,7 +59,7 @@ class CanLogWriter:
         start_ns = 0
         if wall_ns is not None:
             # the headers of Vector and PEAK have milliseconds, and asammdf reads microseconds
-            unit = 1000 if format_ == "mf4" else _MS
+            unit = 1000 if format_ == "mf4" else MS
             start_ns = wall_ns // unit * unit
             self._base_ns = start_ns - wall_ns + origin_ns
         match format_:
@@ -105,8 +104,8 @@ class CanLogWriter:
         # milliseconds; times in ASC are local times
         moment = datetime(1970, 1, 1)  # noqa: DTZ001
         if start_ns is not None:
-            moment = datetime.fromtimestamp(start_ns // SECOND_NS)  # noqa: DTZ006
-        stamp = moment.strftime(f"%a %b %d %H:%M:%S.{(start_ns or 0) // _MS % 1000:03d} %Y")
+            moment = datetime.fromtimestamp(start_ns // SECOND)  # noqa: DTZ006
+        stamp = moment.strftime(f"%a %b %d %H:%M:%S.{(start_ns or 0) // MS % 1000:03d} %Y")
         text = io.TextIOWrapper(file, encoding="ascii", newline="\n", write_through=True)
         writer = ASCWriter(io.StringIO())
         writer.file = text
@@ -130,7 +129,7 @@ class CanLogWriter:
 
         def close() -> None:
             last = writer.stop_timestamp or 0.0
-            writer.start_timestamp = start_ns / SECOND_NS
+            writer.start_timestamp = start_ns / SECOND
             writer.stop_timestamp = writer.start_timestamp + last
             writer.stop()
 
@@ -144,7 +143,7 @@ class CanLogWriter:
         writer.filepath = "kontronik-can-gw"
         writer.first_timestamp = 0.0
         writer.header_written = True
-        writer.write_header(start_ns // _MS / 1000)
+        writer.write_header(start_ns // MS / 1000)
 
         def take(message: "Message") -> None:
             if message.is_error_frame:
@@ -209,7 +208,7 @@ class CanLogWriter:
             for time_ns, frame, received, channel in _logged(frames):
                 take(
                     Message(
-                        (max(time_ns - self._base_ns, 0) + more_ns) / SECOND_NS,
+                        (max(time_ns - self._base_ns, 0) + more_ns) / SECOND,
                         frame.can_id & ~ERROR,
                         frame.extended,
                         is_remote_frame=frame.remote,
