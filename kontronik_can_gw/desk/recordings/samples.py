@@ -338,13 +338,6 @@ def _runs(values: Sequence[Value], lengths: Sequence[int]) -> list[Value]:
     return found
 
 
-def _values_and_count(run: Iterator[Sequence[Value]]) -> tuple[Sequence[Value], int]:
-    """Return the list that a run of rows has in common, and the number of rows."""
-    values = next(run)
-    count = 1 + sum(1 for _ in run)
-    return values, count
-
-
 def _converted(value: Value, slope: float, shift: float) -> Value:
     if not isinstance(value, (int, float)):
         return value
