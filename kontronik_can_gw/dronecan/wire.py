@@ -98,8 +98,9 @@ class Assembler:
     """Assembles received transfers from their frames.
 
     At most ``MAX_TRANSFERS`` are assembled at a time. A further one replaces the oldest. Transfers
-    are dropped, and counted in ``errors``, if a frame is out of order, if their end is not received
-    within two seconds, if they are too long, or if their CRC is wrong.
+    are dropped, and counted in ``errors``, if they are replaced, if another transfer with their id
+    begins, if their end is not received within two seconds, if they are too long, or if their CRC
+    is wrong. A frame out of order, for example a repeated one, is ignored.
     """
 
     def __init__(self) -> None:

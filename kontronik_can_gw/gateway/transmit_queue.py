@@ -34,7 +34,7 @@ class Sent(Enum):
 
 
 class TransmitQueue:
-    """Frames that wait to be sent. Twin in C: ``put`` and ``hand_over`` of native/linux.c.
+    """Frames that wait to be sent. Its twin is ``put`` and ``hand_over`` of native/linux.c.
 
     1. A frame that is not ``queued`` replaces the waiting frame of its id and page, and keeps that
        frame's place. If it belongs to a transfer and the older transfer of its id is half sent, it
@@ -43,8 +43,6 @@ class TransmitQueue:
     3. If the interface did not take all of them, queued and other frames alternate until no frame
        waits. Neither a flood of answers nor fast measurements can then keep the other kind from the
        bus.
-
-    The queue of the loop in C (``native/linux.c``) follows the same rules.
     """
 
     def __init__(self) -> None:
