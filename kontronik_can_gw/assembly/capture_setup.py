@@ -25,10 +25,11 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.capture.format import FORMAT, VERSION, VERSIONS
-from kontronik_can_gw.capture.limits import END_OF_TIME, check_state
+from kontronik_can_gw.capture.limits import check_state
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.core.header_parts import (
+    LATEST_NS,
     HeaderError,
     esc_json,
     esc_of,
@@ -44,12 +45,12 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.times import END_OF_TIME
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
 Header = Mapping[str, Any]
-_LATEST_NS = 1 << 62
 _MAX_PATH = 4096
 _MAX_ESCS = 1000
 _IN_HEADER = ("canopen",)
@@ -203,7 +204,7 @@ def _check(header: Header) -> None:
     for name, latest in (
         ("monotonic_ns", END_OF_TIME - 1),
         ("created_ns", END_OF_TIME - 1),
-        ("wall_ns", _LATEST_NS),
+        ("wall_ns", LATEST_NS),
     ):
         if header.get(name) is not None:
             whole_number(header[name], 0, latest)

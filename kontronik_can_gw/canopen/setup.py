@@ -23,6 +23,7 @@ from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAX_TPDOS
 from kontronik_can_gw.canopen.storage import Stored, decode, encode
 from kontronik_can_gw.config.keys import Config, shipped
 from kontronik_can_gw.core.header_parts import (
+    LATEST_NS,
     esc_json,
     esc_of,
     file_bytes,
@@ -41,7 +42,6 @@ from kontronik_can_gw.times import SECOND
 _SHIPPED = "eds/kontronik_esc.eds"
 _MIRRORS = range(0x6000, 0x6800)
 """Objects of CiA 402 that show values of others."""
-_LATEST_NS = 1 << 62
 
 
 class _Needs(NamedTuple):
@@ -319,7 +319,7 @@ def _node(found: Mapping[str, Any]) -> NodeSettings:
         self_start=bool(found["self_start"]),
         read_only=bool(found["read_only"]),
         bitrate=whole_number(found["bitrate"], 1, 100_000_000),
-        segment_ns=whole_number(found["segment_ns"], 0, _LATEST_NS),
+        segment_ns=whole_number(found["segment_ns"], 0, LATEST_NS),
         version=short_text(found["version"], 100),
         device=device,
     )

@@ -5,12 +5,10 @@ from typing import Any
 
 from kontronik_can_gw.capture.format import COUNTERS
 from kontronik_can_gw.core.header_parts import whole_number
+from kontronik_can_gw.esc.telemetry import MAX_COUNT
+from kontronik_can_gw.times import END_OF_TIME, SECOND
 
-END_OF_TIME = 1 << 61
-"""ns. No gateway has later times. The sums of earlier times fit into 64 bits."""
-MAX_COUNT = 1 << 48
-"""Limit of a counter, and of an energy in mW s. At 1 Mbit/s it takes more than a human life."""
-_MAX_MW_NS = MAX_COUNT * 1_000_000_000
+_MAX_MW_NS = MAX_COUNT * SECOND
 
 
 def check_time(time_ns: int) -> None:

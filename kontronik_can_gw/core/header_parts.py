@@ -20,6 +20,8 @@ _UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError
 _MAX_NAME = 12
 """Maximum length of an ESC's name."""
 _MAX_GEAR = 10**12
+LATEST_NS = 1 << 62
+"""Largest time or duration in a header, in ns."""
 
 
 class HeaderError(ValueError):

@@ -18,6 +18,8 @@ INFO_TIMEOUT_NS = 10 * SECOND
 
 An ESC sends an info frame every second, or every five seconds if it sends at 20 Hz.
 """
+MAX_COUNT = 1 << 48
+"""Limit of a counter, and of an energy in mW s. At 1 Mbit/s it takes more than a human life."""
 
 
 class LinkState(IntEnum):

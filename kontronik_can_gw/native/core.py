@@ -13,7 +13,6 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, SlotRow, held_settings
-from kontronik_can_gw.native.scale import END_OF_TIME
 from kontronik_can_gw.native.slots import (
     NativeSlot,
     Place,
@@ -27,6 +26,7 @@ from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.native.turns import Turns
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import GatewayStatus
+from kontronik_can_gw.times import END_OF_TIME
 
 _MAX_FRAMES = 256
 _WORD = (1 << 64) - 1

@@ -11,10 +11,12 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
+from kontronik_can_gw.esc.telemetry import MAX_COUNT
 from kontronik_can_gw.esc.values import Divisor, Kind, Value
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import MAX_GEAR, MAX_POLES, NotInCore
 from kontronik_can_gw.signals.plan import SignalPlan
+from kontronik_can_gw.times import END_OF_TIME
 
 _TYPE_RANGES = {
     KCG.U8: (0, 0xFF),
@@ -23,16 +25,12 @@ _TYPE_RANGES = {
     KCG.I16: (-0x8000, 0x7FFF),
     KCG.U32: (0, 0xFFFF_FFFF),
 }
-MAX_COUNT = 1 << 48
-"""Limit of a counter or an integral. At 1 Mbit/s it is reached after more than a human life."""
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
     Divisor.POLE_PAIRS: (MAX_POLES, 1),
     Divisor.OUTPUT: (MAX_POLES * MAX_GEAR, MAX_GEAR),
     Divisor.CELLS: (255, 1),
 }
-END_OF_TIME = 1 << 61
-"""Limit of times in ns. Sums of times stay within int64."""
 _LIMIT = 1 << 63
 _MAX_DIGITS = 15
 """Digits that a factor of a DBC has at most."""

@@ -31,10 +31,11 @@ from kontronik_can_gw.native.rows import (
     bind_direction,
     settings_of,
 )
-from kontronik_can_gw.native.scale import END_OF_TIME, set_scale
+from kontronik_can_gw.native.scale import set_scale
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
 from kontronik_can_gw.status import GatewayState
+from kontronik_can_gw.times import END_OF_TIME
 
 ALL_ESCS = 255
 MAX_ROWS = 0xFFFF

@@ -11,10 +11,12 @@ import pytest
 from capture_bench import START, Bench, capture, made
 
 from kontronik_can_gw.capture.format import COUNTERS, Entry, Kind, numbers_data
-from kontronik_can_gw.capture.limits import END_OF_TIME, MAX_COUNT, check_state
+from kontronik_can_gw.capture.limits import check_state
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.esc.telemetry import MAX_COUNT
+from kontronik_can_gw.times import END_OF_TIME
 
 GOOD = {
     "escs": [{"energy": 5, "run_time": 6, "losses": 7}],

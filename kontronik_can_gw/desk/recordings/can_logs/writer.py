@@ -14,15 +14,13 @@ from typing import IO, TYPE_CHECKING, Any, cast
 from kontronik_can_gw.desk.recordings.can_logs.channels import Channels
 from kontronik_can_gw.desk.recordings.recording import ERROR, LogFrame
 from kontronik_can_gw.light_imports import without_asammdf
-from kontronik_can_gw.times import MS, SECOND
+from kontronik_can_gw.times import END_OF_TIME, MS, SECOND
 
 if TYPE_CHECKING:
     from can import Message
 
     from kontronik_can_gw.desk.recordings.recording import Batch
 
-_LATEST_NS = 1 << 61
-"""Latest time that the C core writes as text."""
 _DIRECTIONS = {True: " R", False: " T", None: ""}
 """Ends of the lines of candump."""
 
@@ -79,7 +77,7 @@ class CanLogWriter:
         name_of = self.channels.name_of
 
         def write(frames: "Batch") -> None:
-            if not isinstance(frames, list) and 0 <= frames.times[0] + half < _LATEST_NS:
+            if not isinstance(frames, list) and 0 <= frames.times[0] + half < END_OF_TIME:
                 file.write(frames.candump(half, name_of("")))
                 return
             for time_ns, frame, received, channel in _logged(frames):
