@@ -10,4 +10,9 @@ if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
 from kontronik_can_gw.cli import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    if code == _signal.SIGINT + 128:
+        # If Ctrl-C arrived inside exec(), for example while a dataclass was made, python -m
+        # sends itself SIGINT after this line, and its parent would not get the exit code.
+        _signal.pthread_sigmask(_signal.SIG_BLOCK, [_signal.SIGINT])
+    sys.exit(code)

@@ -209,6 +209,22 @@ def test_a_signal_before_any_row_leaves_no_file(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["whole.log"]
 
 
+def test_an_interrupt_inside_exec_is_an_exit_code(tmp_path: Path) -> None:
+    """Dataclasses call exec() while a module loads. After that, python -m kills itself."""
+    tmp_path.joinpath("interrupted.py").write_text(
+        "import runpy\n"
+        "from kontronik_can_gw.cli import convert\n"
+        "def interrupt(*_):\n"
+        "    exec('raise KeyboardInterrupt')\n"
+        "convert._convert = interrupt\n"
+        "runpy.run_module('kontronik_can_gw', run_name='__main__', alter_sys=True)\n"
+    )
+    command = [sys.executable, "-m", "interrupted", "convert", "in.kcap", "out.csv"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
+    assert done.returncode == 130
+    assert done.stderr == b"kontronik-can-gw convert: stopped: nothing is written\n"
+
+
 def _bytes_in(pipe: IO[bytes]) -> int:
     count = array.array("i", [0])
     fcntl.ioctl(pipe.fileno(), termios.FIONREAD, count)
