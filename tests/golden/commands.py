@@ -3,6 +3,7 @@
 ``play`` runs the command lines of a file and returns it with the current results.
 """
 
+import difflib
 import io
 import logging
 import os
@@ -10,7 +11,7 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
@@ -30,6 +31,8 @@ SURROUNDINGS = (
     "NO_COLOR",
 )
 """Environment variables that are removed because they change the output."""
+_SHOWN_ONCE = {"configuration", "dcf", "signals"}
+"""Forms that are shown whole at their first use in a file, and as changes after that."""
 _RESULT = re.compile(r"(\||!|=>) ?")
 _WORD = re.compile(r"'([^']*)'|(\S+)")
 
@@ -49,16 +52,45 @@ def cases(text: str) -> dict[str, list[str]]:
     return found
 
 
+class _Shown:
+    """Shows the content of outputs. Long forms are shown whole once in a file, then as changes."""
+
+    def __init__(self) -> None:
+        self._first: dict[str, list[str]] = {}
+
+    def lines(self, form: str, data: bytes) -> Sequence[str]:
+        content = meaning.FORMS[form](data)
+        if form not in _SHOWN_ONCE:
+            return content
+        if form not in self._first:
+            self._first[form] = content
+            return content
+        changes = _changes(self._first[form], content)
+        if len(changes) * 2 > len(content):
+            return content
+        return [f"the first {form} of this file, except {len(changes)} lines", *changes]
+
+
+def _changes(old: list[str], new: list[str]) -> list[str]:
+    """Return the removed lines with "-" and the added ones with "+"."""
+    changes = []
+    for line in difflib.unified_diff(old, new, n=0, lineterm=""):
+        if not line.startswith(("---", "+++", "@@")):
+            changes.append(f"{line[0]} {line[1:]}")
+    return changes
+
+
 def play(text: str) -> str:
     """Return the file's text with the current results."""
     out: list[str] = []
+    shown = _Shown()
     for lines in cases(text).values():
         with _place() as folder:
-            out += _play_case(lines, folder)
+            out += _play_case(lines, folder, shown)
     return "\n".join(out) + "\n"
 
 
-def _play_case(lines: list[str], folder: Path) -> Iterator[str]:
+def _play_case(lines: list[str], folder: Path, shown: _Shown) -> Iterator[str]:
     name = ""
     source = ""
     body: list[str] = []
@@ -77,7 +109,7 @@ def _play_case(lines: list[str], folder: Path) -> Iterator[str]:
                 yield line
             elif line != "$":
                 yield line
-                yield from _run(line[2:], folder)
+                yield from _run(line[2:], folder, shown)
         elif name:
             body.append(line)
             yield line
@@ -142,7 +174,7 @@ def _edited(text: str, edits: list[str]) -> str:
     return newline.join(lines)
 
 
-def _run(line: str, folder: Path) -> Iterator[str]:
+def _run(line: str, folder: Path, shown: _Shown) -> Iterator[str]:
     line, _, how = line.partition(" | ")
     words = [quoted or plain for quoted, plain in _WORD.findall(line)]
     out = io.TextIOWrapper(io.BytesIO(), "utf-8")
@@ -163,14 +195,14 @@ def _run(line: str, folder: Path) -> Iterator[str]:
     out.flush()
     data = out.buffer.getvalue()
     if how and data and code == 0:
-        shown = meaning.FORMS[how](data)
+        content = shown.lines(how, data)
     else:
-        shown = data.decode("utf-8").splitlines()
+        content = data.decode("utf-8").splitlines()
     lines = err.getvalue().splitlines()
     talk = [text for text in lines if not text.startswith(("usage: ", "  "))]
     if len(talk) > LINES:
         talk[LINES:] = [f"... and {len(talk) - LINES} more lines"]
-    yield from (f"| {_neutral(text, folder)}".rstrip() for text in shown)
+    yield from (f"| {_neutral(text, folder)}".rstrip() for text in content)
     yield from (f"! {_neutral(text, folder)}".rstrip() for text in talk)
     yield f"=> {code}"
 

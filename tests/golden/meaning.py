@@ -275,6 +275,20 @@ def signals(data: bytes) -> list[str]:
     return lines
 
 
+def signals_short(data: bytes) -> list[str]:
+    """Return a line for each message: its name, id, number of signals, and a digest of them."""
+    lines = []
+    message: list[str] = []
+    for line in [*signals(data), "end"]:
+        if line.startswith("  "):
+            message.append(line)
+            continue
+        if message:
+            lines.append(f"{message[0]} {len(message) - 1} signals {_digest(message)}")
+        message = [line]
+    return lines
+
+
 FORMS: dict[str, Callable[[bytes], list[str]]] = {
     "dbc": dbc,
     "dbc short": dbc_short,
@@ -288,6 +302,7 @@ FORMS: dict[str, Callable[[bytes], list[str]]] = {
     ],
     "configuration": configuration,
     "signals": signals,
+    "signals short": signals_short,
     "size": lambda data: [f"{len(data)} bytes, {zlib.crc32(data):08X}"],
     "log": _log(".log"),
     "asc": _log(".asc"),
