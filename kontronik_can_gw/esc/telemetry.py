@@ -79,11 +79,11 @@ class EscTelemetry:
     protocol: EscProtocol
     settings: EscSettings
     live: Data | None = None
-    """Newest live data. None unless it is fresh."""
+    """The newest measurements. None unless they are fresh."""
     info: Data | None = None
     """Newest info data of the device now on the line. None unless it is fresh."""
     last_live: Data | None = None
-    """Newest live data, fresh or not, in the layout now on the line."""
+    """The newest measurements, fresh or not, in the layout now on the line."""
     last_info: Data | None = None
     """Newest info data, fresh or not, in the layout now on the line."""
     device: int | None = None
@@ -103,7 +103,7 @@ class EscTelemetry:
     None in the first second after the link came up.
     """
     losses: int = 0
-    """Times that live data became too old."""
+    """How often ``live`` became too old."""
     suspect_frames: int = 0
     """Live frames with an impossible value outside their checksum."""
     late_frames: int = 0

@@ -173,7 +173,7 @@ class FedEsc:
         self.sent = array("q")
         """Monotonic nanoseconds at which live frame n was sent."""
         self.whole = bytearray()
-        """1 if live frame n was sent completely."""
+        """1 for each of these frames that was sent completely."""
         self.seen = bytearray()
         """Messages with live frame n that were seen on the bus. The bus watch writes it."""
         self.info_sent = array("q")

@@ -29,10 +29,7 @@ def wire(**values: int) -> bytes:
 
 
 class Bench:
-    """A gateway with one message that runs at each of its deadlines.
-
-    By default each live frame sends the message.
-    """
+    """A gateway with one message that runs at each of its deadlines."""
 
     def __init__(self, signal: Sig, more: str = EVENT) -> None:
         self.gateway = Gateway((ESC,), compiled(text_of(signal, more)), 0)
@@ -41,7 +38,7 @@ class Bench:
         self.first = self.take()
 
     def live(self, **values: int) -> int:
-        """Receive a live frame after one period. Return the value of the message after that."""
+        """Receive a frame after one period. Return the value of the message after that."""
         return int.from_bytes(self.read(wire(**values))[-1], "little")
 
     def info(self, device: Device) -> None:

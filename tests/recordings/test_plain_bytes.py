@@ -35,8 +35,8 @@ STREAMS: dict[str, Callable[[random.Random], bytes]] = {
 def assumed_times(found: list[Found]) -> list[int]:
     """Return the times of frames in a file of plain bytes, which has no times.
 
-    There is one live frame in each period. An info frame is placed half a period before the next
-    live frame, but not before the previous frame.
+    There is one live frame in each period. An info frame is placed half a period before the frame
+    that follows it, but not before the previous one.
     """
     times: list[int] = []
     lives = 0

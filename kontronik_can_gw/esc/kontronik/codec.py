@@ -66,7 +66,7 @@ FORMS = (
     Form(is_info=True, layout=Layout.LEGACY),
     Form(is_info=True, layout=Layout.V4),
 )
-"""All four forms, in the order in which they are tried: the shorter one of a kind first."""
+"""All four forms in the order of the search: the shorter one of each kind is first."""
 
 FORMS_BY_HEADER = {
     header: tuple(form for form in FORMS if form.header == header)
