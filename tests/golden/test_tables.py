@@ -21,7 +21,7 @@ Cells = dict[str, str]
 
 
 def expected_rows(stream: bytes) -> list[Cells]:
-    """Return the cells that each live frame of the stream must have in a table."""
+    """Return the cells that a table must have for each measurement in the stream."""
     rows = []
     for frame in reference.frames_of(stream):
         if frame.kind == "live":
@@ -50,7 +50,7 @@ def spelled(number: int, steps: int) -> str:
 
 
 def rows_in(table: Path, prefix: str, names: Cells) -> Iterator[Cells]:
-    """Yield these cells of each row that has live data of the ESC and a new live frame."""
+    """Yield these cells of each row with new measurements of the ESC."""
     seen = ""
     with table.open(newline="", encoding="utf-8") as lines:
         for row in csv.DictReader(lines):
