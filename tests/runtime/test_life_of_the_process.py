@@ -33,7 +33,12 @@ can = {{interface = "virtual"}}
 canopen = {{enabled = true, self_start = true, store = "{folder}/store"}}
 record = {{can_log = "blf"}}
 run = {{realtime_priority = 7}}
-esc = [{{port = "{ports[0]}"}}, {{port = "{ports[1]}"}}]
+[[esc]]
+port = "{ports[0]}"
+telemetry_timeout_ms = 60000  # a busy machine may feed an ESC late
+[[esc]]
+port = "{ports[1]}"
+telemetry_timeout_ms = 60000
 """
 
 
