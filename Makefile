@@ -1,7 +1,7 @@
 # Each target sets up what it needs, in .venv; nothing has to be installed before but Python 3.11 or newer.
 # ARGS is passed on:  make demo ARGS=--help    make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-all release soak hour bench golden docs pictures wheels deb lint prose clean
+.PHONY: help demo test test-all release soak hour bench conformance golden docs pictures wheels deb lint prose clean
 
 help:
 	@echo 'make demo      show the gateway at work, without any hardware      (ARGS="...": see make demo ARGS=--help)'
@@ -13,6 +13,7 @@ help:
 	@echo 'make soak      random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
 	@echo 'make hour      a recorded hour through every format, read back and compared   (ARGS="--minutes 6")'
 	@echo 'make bench     speed, delay and memory beside a C program and the obvious one   (ARGS="--list" ARGS="--only cpu --seconds 10")'
+	@echo 'make conformance  test the CANopen node against CiA 301, 305, 306 and write the report   (another slave: ARGS="--node 5 --eds x.eds --channel can0")'
 	@echo 'make golden    record the golden set anew and say what changed   (ARGS="--check" ARGS="flights/v4")'
 	@echo 'make docs      write docs/reference from the sources'
 	@echo 'make pictures  draw docs/pictures: live screen and report; all sizes of them by ARGS=FOLDER'
@@ -49,6 +50,17 @@ hour:
 bench:
 	@tests/bootstrap.sh lint
 	@.venv/bin/python tests/benchmarks/bench.py $(ARGS)
+
+conformance:
+	@tests/bootstrap.sh test
+	@if [ -n "$(ARGS)" ]; then \
+		.venv/bin/kontronik-can-gw conformance $(ARGS); \
+	else \
+		mkdir -p build/conformance && \
+		tests/vm/run --rw build/conformance -- \
+			.venv/bin/python tests/vcan/conformance_report.py build/conformance && \
+		cp build/conformance/conformance.md docs/reference/conformance.md; \
+	fi
 
 golden:
 	@tests/bootstrap.sh lint

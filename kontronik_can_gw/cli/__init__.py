@@ -50,6 +50,7 @@ COMMANDS = {
     "mqtt": "publish the ESCs' values from the bus to an MQTT broker",
     "metrics": "serve a gateway's statistics for Prometheus",
     "export": "write the core in C and the tables of a DBC, for a firmware",
+    "conformance": "test a CANopen slave on a bus against CiA 301, 305 and 306",
     "schema": "print the JSON Schema of the configuration",
     "describe": "describe the messages, objects and errors of the gateway, with remedies",
     "completion": "print the completion script of a shell",

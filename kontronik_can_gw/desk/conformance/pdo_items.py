@@ -1,0 +1,349 @@
+"""TPDOs and SYNC: CiA 301, 7.2.2 and 7.2.5."""
+
+from functools import partial
+
+from kontronik_can_gw.desk.conformance.items import Skipped, item, require, require_abort
+from kontronik_can_gw.desk.conformance.nmt_items import ENTER_PRE_OPERATIONAL, START, STOP
+from kontronik_can_gw.desk.conformance.sdo_items import (
+    NO_OBJECT,
+    VALUE_RANGE,
+    VALUE_TOO_HIGH,
+    VALUE_TOO_LOW,
+    is_writable,
+)
+from kontronik_can_gw.desk.conformance.slave import Abort, Frame, Slave
+
+_COMMUNICATION = 0x1800
+_MAPPING = 0x1A00
+_INVALID = 1 << 31
+_NO_RTR = 1 << 30
+_EXTENDED = 1 << 29
+_CANNOT_BE_MAPPED = 0x06040041
+_TOO_LONG = 0x06040042
+_RESERVED_TYPES = (241, 245, 251)
+_OTHER_SYNC = 0x0FE
+_LIMITS = (VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW)
+
+
+class Tpdo:
+    """The first TPDO of the slave, which no other frame on the bus disturbs.
+
+    All other TPDOs are disabled.
+    """
+
+    def __init__(self, slave: Slave) -> None:
+        if not slave.has(_COMMUNICATION, 1):
+            raise Skipped("the slave has no TPDO")
+        self.slave = slave
+        self.cob_id = 0x180 + slave.node_id
+        for index in slave.dictionary:
+            if _COMMUNICATION < index < _MAPPING:
+                slave.write_number(index, 1, _INVALID | _NO_RTR | 0x180 + slave.node_id)
+        self.disable()
+
+    def disable(self) -> None:
+        self.slave.write_number(_COMMUNICATION, 1, _INVALID | _NO_RTR | self.cob_id)
+
+    def enable(self, transmission_type: int) -> None:
+        self.slave.write_number(_COMMUNICATION, 2, transmission_type)
+        if self.slave.has(_COMMUNICATION, 5):
+            self.slave.write_number(_COMMUNICATION, 5, 0)
+        self.slave.write_number(_COMMUNICATION, 1, _NO_RTR | self.cob_id)
+
+    def seen_in(self, frames: list[Frame]) -> list[Frame]:
+        return [frame for frame in frames if frame.can_id == self.cob_id]
+
+    def count_with_syncs(self, count: int) -> int:
+        """Return the number of TPDOs after this many SYNCs, which are sent one by one."""
+        seen = 0
+        for _ in range(count):
+            self.slave.sync()
+            seen += len(self.seen_in(self.slave.frames_until_answer()))
+        return seen + len(self.seen_in(self.slave.frames_until_answer()))
+
+    def length(self) -> int:
+        """Return the number of bytes that the mapping has."""
+        count = self.slave.number(_MAPPING, 0)
+        bits = 0
+        for sub in range(1, count + 1):
+            bits += self.slave.number(_MAPPING, sub) & 0xFF
+        return (bits + 7) // 8
+
+    def require_writable_mapping(self) -> None:
+        variable = self.slave.variable(_MAPPING, 0)
+        if variable is None or not is_writable(variable):
+            raise Skipped("the mapping of the first TPDO cannot be changed")
+
+
+@item("CiA 301, 7.2.2", "type 1 and 10 SYNCs in OPERATIONAL", "10 TPDOs, as long as the mapping")
+def pdo_each_sync(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.enable(1)
+    slave.nmt(START)
+    slave.sync()
+    frame = slave.wait_for(lambda frame: frame.can_id == tpdo.cob_id)
+    require(len(frame.data) == tpdo.length(), f"{len(frame.data)} bytes, not {tpdo.length()}")
+    count = 1 + tpdo.count_with_syncs(9)
+    require(count == 10, f"{count} TPDOs")
+    return f"10 TPDOs of {len(frame.data)} bytes"
+
+
+@item("CiA 301, 7.2.2", "type 3 and 12 SYNCs in OPERATIONAL", "4 TPDOs")
+def pdo_each_third_sync(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.enable(3)
+    slave.nmt(START)
+    count = tpdo.count_with_syncs(12)
+    require(count == 4, f"{count} TPDOs")
+    return "4 TPDOs"
+
+
+@item(
+    "CiA 301, 7.2.2 (test tool PDO 07)",
+    "type 0 (acyclic) and 5 SYNCs in OPERATIONAL",
+    "no TPDO without a SYNC, and at most one for each SYNC",
+)
+def pdo_acyclic(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.enable(0)
+    slave.nmt(START)
+    without = len(tpdo.seen_in(slave.frames_during(0.2)))
+    require(without == 0, f"{without} TPDOs without a SYNC")
+    count = tpdo.count_with_syncs(5)
+    require(count <= 5, f"{count} TPDOs after 5 SYNCs")
+    return f"{count} TPDOs after 5 SYNCs; only a changed value needs one"
+
+
+@item("CiA 301, 7.2.2", "TPDO disabled by bit 31, and SYNCs", "no TPDO")
+def pdo_disabled(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.enable(1)
+    tpdo.disable()
+    slave.nmt(START)
+    count = tpdo.count_with_syncs(3)
+    require(count == 0, f"{count} TPDOs")
+    return "no TPDO"
+
+
+@item("CiA 301, 7.3.2.2", "type 1 and SYNCs in PRE-OPERATIONAL", "no TPDO")
+def pdo_none_in_pre_operational(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.enable(1)
+    slave.nmt(ENTER_PRE_OPERATIONAL)
+    count = tpdo.count_with_syncs(3)
+    require(count == 0, f"{count} TPDOs")
+    return "no TPDO"
+
+
+@item(
+    "CiA 301, 7.3.2.2 (test tool State 04)",
+    "type 1, NMT stop, and SYNCs while STOPPED",
+    "no TPDO",
+)
+def pdo_none_while_stopped(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.enable(1)
+    slave.nmt(START)
+    slave.frames_until_answer()
+    slave.nmt(STOP)
+    for _ in range(3):
+        slave.sync()
+    slave.nmt(ENTER_PRE_OPERATIONAL)
+    count = len(tpdo.seen_in(slave.frames_until_answer()))
+    require(count == 0, f"{count} TPDOs")
+    return "no TPDO"
+
+
+@item("CiA 301, 1800h:5", "type 254 with an event timer of 100 ms", "at least 8 TPDOs a second")
+def pdo_event_timer(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    if not slave.has(_COMMUNICATION, 5):
+        raise Skipped("the EDS does not have 1800h:5")
+    tpdo.enable(254)
+    slave.write_number(_COMMUNICATION, 5, 100)
+    slave.nmt(START)
+    count = len(tpdo.seen_in(slave.frames_during(1.0)))
+    require(count >= 8, f"{count} TPDOs")
+    return f"{count} TPDOs in a second"
+
+
+@item("CiA 301, 1800h:1", "new COB-ID while the TPDO is valid", "abort")
+def pdo_cob_id_change_while_valid(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.enable(1)
+    answer = require_abort(lambda: slave.write_number(_COMMUNICATION, 1, _NO_RTR | 0x1FF))
+    found = slave.number(_COMMUNICATION, 1) & 0x7FF
+    require(found == tpdo.cob_id, f"the COB-ID is {found:03X}h now")
+    return answer
+
+
+@item("CiA 301, 7.3.5", "restricted COB-IDs 000h, 001h, 580h + node-ID, 6E0h and 7FFh", "abort")
+def pdo_restricted_cob_ids(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    answer = ""
+    for cob_id in (0x000, 0x001, 0x580 + slave.node_id, 0x6E0, 0x7FF):
+        tpdo.disable()
+        new = _NO_RTR | cob_id
+        answer = require_abort(partial(slave.write_number, _COMMUNICATION, 1, new), *_LIMITS)
+    return f"{answer} each"
+
+
+@item("CiA 301, 1800h:1", "29-bit COB-ID", "accepted, or abort 06090030h")
+def pdo_extended_cob_id(slave: Slave) -> str:
+    Tpdo(slave)
+    new = _INVALID | _NO_RTR | _EXTENDED | 0x12345
+    try:
+        return require_abort(lambda: slave.write_number(_COMMUNICATION, 1, new), *_LIMITS)
+    finally:
+        if slave.number(_COMMUNICATION, 1) == new:
+            raise Skipped("the slave supports 29-bit COB-IDs")
+
+
+@item("CiA 301, 1800h:2", "reserved transmission types 241, 245 and 251", "abort")
+def pdo_reserved_types(slave: Slave) -> str:
+    Tpdo(slave)
+    answer = ""
+    for number in _RESERVED_TYPES:
+        answer = require_abort(partial(slave.write_number, _COMMUNICATION, 2, number), *_LIMITS)
+    return f"{answer} each"
+
+
+@item("CiA 301, 1800h:2", "types 252 and 253 (on a remote frame)", "accepted, or abort 06090030h")
+def pdo_remote_types(slave: Slave) -> str:
+    Tpdo(slave)
+    answers = []
+    for number in (252, 253):
+        try:
+            slave.write_number(_COMMUNICATION, 2, number)
+        except Abort as abort:
+            answers.append(str(abort))
+            require(abort.code in _LIMITS, str(abort))
+        else:
+            answers.append("accepted")
+    return f"252: {answers[0]}, 253: {answers[1]}"
+
+
+@item("CiA 301, 1800h:3", "new inhibit time while the TPDO is valid", "abort")
+def pdo_inhibit_time_while_valid(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    if not slave.has(_COMMUNICATION, 3):
+        raise Skipped("the EDS does not have 1800h:3")
+    tpdo.enable(254)
+    return require_abort(lambda: slave.write_number(_COMMUNICATION, 3, 50))
+
+
+@item("CiA 301, 1A00h", "new mapping entry while sub-index 0 is not 0", "abort, nothing changes")
+def pdo_mapping_while_active(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.require_writable_mapping()
+    if slave.number(_MAPPING, 0) == 0:
+        raise Skipped("the first TPDO has no mapping")
+    before = slave.number(_MAPPING, 1)
+    answer = require_abort(lambda: slave.write_number(_MAPPING, 1, before))
+    require(slave.number(_MAPPING, 1) == before, "the mapping has changed")
+    return answer
+
+
+@item(
+    "CiA 301, 1A00h (test tool PDO 22)",
+    "mapping procedure: disable, number 0, new entry, number 1, enable; then a SYNC",
+    "a TPDO with the bytes of the new object only",
+)
+def pdo_mapping_procedure(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.require_writable_mapping()
+    target = next((v for v in slave.variables() if v.pdo_mappable and v.access_type != "wo"), None)
+    if target is None:
+        raise Skipped("the EDS has no object that can be mapped")
+    slave.write_number(_MAPPING, 0, 0)
+    entry = target.index << 16 | target.subindex << 8 | len(target)
+    slave.write_number(_MAPPING, 1, entry)
+    slave.write_number(_MAPPING, 0, 1)
+    tpdo.enable(1)
+    slave.nmt(START)
+    slave.sync()
+    frame = slave.wait_for(lambda frame: frame.can_id == tpdo.cob_id)
+    require(8 * len(frame.data) == len(target), f"{len(frame.data)} bytes")
+    return f"{len(frame.data)} bytes of {target.index:04X}h:{target.subindex:02X}"
+
+
+def _refused_entry(slave: Slave, entry: int, *codes: int) -> str:
+    """Map an entry. Both the entry and the number of entries may be refused."""
+    tpdo = Tpdo(slave)
+    tpdo.require_writable_mapping()
+    slave.write_number(_MAPPING, 0, 0)
+
+    def map_it() -> None:
+        slave.write_number(_MAPPING, 1, entry)
+        slave.write_number(_MAPPING, 0, 1)
+
+    return require_abort(map_it, *codes)
+
+
+@item("CiA 301, 1A00h", "mapping of an object that does not exist", "abort 06020000h or 06040041h")
+def pdo_mapping_of_no_object(slave: Slave) -> str:
+    index = next(index for index in range(0x5FFF, 0x2000, -1) if index not in slave.dictionary)
+    return _refused_entry(slave, index << 16 | 0x08, NO_OBJECT, _CANNOT_BE_MAPPED)
+
+
+@item("CiA 301, 1A00h", "mapping of an object without PDO mapping", "abort 06040041h")
+def pdo_mapping_of_an_unmappable_object(slave: Slave) -> str:
+    return _refused_entry(slave, 0x1000_00_20, _CANNOT_BE_MAPPED)
+
+
+@item("CiA 301, 1A00h", "mapping of more than 8 bytes", "abort 06040042h")
+def pdo_mapping_too_long(slave: Slave) -> str:
+    tpdo = Tpdo(slave)
+    tpdo.require_writable_mapping()
+    wide = [v for v in slave.variables() if v.pdo_mappable and len(v) == 32]
+    if not wide:
+        raise Skipped("the EDS has no object of 32 bits that can be mapped")
+    entry = wide[0].index << 16 | wide[0].subindex << 8 | 32
+    if not slave.has(_MAPPING, 3):
+        raise Skipped("the mapping has fewer than three entries")
+    slave.write_number(_MAPPING, 0, 0)
+
+    def map_three() -> None:
+        for sub in (1, 2, 3):
+            slave.write_number(_MAPPING, sub, entry)
+        slave.write_number(_MAPPING, 0, 3)
+
+    return require_abort(map_three, _TOO_LONG)
+
+
+@item("CiA 301, 1019h", "SYNC counter overflow of 1 and 241", "abort 06090030h")
+def sync_counter_range(slave: Slave) -> str:
+    if not slave.has(0x1019):
+        raise Skipped("the EDS does not have 1019h")
+    answer = ""
+    for value in (1, 241):
+        answer = require_abort(partial(slave.write_number, 0x1019, 0, value), *_LIMITS)
+    return f"{answer} each"
+
+
+@item("CiA 301, 1005h", "SYNC producer bit for a slave that is only a consumer", "abort")
+def sync_producer_is_refused(slave: Slave) -> str:
+    if not slave.has(0x1005):
+        raise Skipped("the EDS does not have 1005h")
+    if slave.has(0x1006):
+        raise Skipped("the slave can produce SYNC (1006h)")
+    return require_abort(lambda: slave.write_number(0x1005, 0, _NO_RTR | 0x80))
+
+
+@item("CiA 301, 1005h", "1005h = 0FEh, then SYNCs with 080h and 0FEh", "a TPDO only after 0FEh")
+def sync_cob_id(slave: Slave) -> str:
+    if not slave.has(0x1005):
+        raise Skipped("the EDS does not have 1005h")
+    variable = slave.variable(0x1005)
+    if variable is None or not is_writable(variable):
+        raise Skipped("1005h cannot be written")
+    tpdo = Tpdo(slave)
+    tpdo.enable(1)
+    slave.write_number(0x1005, 0, _OTHER_SYNC)
+    slave.nmt(START)
+    slave.sync()
+    old = len(tpdo.seen_in(slave.frames_until_answer()))
+    slave.send(_OTHER_SYNC, b"")
+    slave.wait_for(lambda frame: frame.can_id == tpdo.cob_id)
+    require(old == 0, "a TPDO also after the old SYNC")
+    return "a TPDO"

@@ -1,0 +1,183 @@
+"""Runs the items of a conformance test, and writes the results as a table and as JUnit."""
+
+import time
+import tomllib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree as ET
+
+from kontronik_can_gw.desk.conformance import (  # these modules add their items
+    eds_items,
+    emergency_items,
+    lss_items,
+    nmt_items,
+    od_items,
+    pdo_items,
+    sdo_items,
+    storage_items,
+)
+from kontronik_can_gw.desk.conformance.items import ITEMS, Item, Skipped, Wrong
+from kontronik_can_gw.desk.conformance.nmt_items import RESET_NODE
+from kontronik_can_gw.desk.conformance.slave import Abort, NoAnswer, Slave, UnexpectedAnswer
+from kontronik_can_gw.errors import UserError, did_you_mean
+
+GROUPS = (
+    ("NMT and heartbeat", nmt_items),
+    ("SDO", sdo_items),
+    ("Object dictionary", od_items),
+    ("PDO and SYNC", pdo_items),
+    ("Emergencies", emergency_items),
+    ("Stored parameters", storage_items),
+    ("EDS", eds_items),
+    ("LSS", lss_items),
+)
+
+
+def all_items() -> list[Item]:
+    """Return all items in the order of the test."""
+    modules = [module.__name__ for _, module in GROUPS]
+    return sorted(ITEMS, key=lambda item: modules.index(item.run.__module__))
+
+
+class Verdict(Enum):
+    """The result of an item."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    DEVIATES = "deviates"
+    """It failed, and the file of deviations gives a reason."""
+    SKIPPED = "not supported"
+    """The slave does not have the optional service."""
+
+
+class Result(NamedTuple):
+    """One item, the observed answer and its verdict."""
+
+    item: Item
+    answer: str
+    verdict: Verdict
+    reason: str
+    """Reason of a deviation, or ""."""
+    seconds: float
+
+
+def read_deviations(path: Path | None) -> dict[str, str]:
+    """Return the reasons of deliberate deviations by the name of the item.
+
+    The file is TOML with lines such as ``od-vendor-id-is-assigned = "only CiA assigns one"``.
+    Raises UserError if it is unreadable or names no item.
+    """
+    if path is None:
+        return {}
+    try:
+        found = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: is not valid TOML: {error}.") from None
+    names = [item.name for item in all_items()]
+    for name, reason in found.items():
+        if name not in names:
+            raise UserError(f"{path}: there is no item {name!r}.{did_you_mean(name, names)}")
+        if not isinstance(reason, str) or not reason.strip():
+            raise UserError(f"{path}: {name}: give the reason of the deviation as a text.")
+    return found
+
+
+def chosen_items(words: Sequence[str]) -> list[Item]:
+    """Return the items whose names contain one of the words. No words: all items."""
+    chosen = [item for item in all_items() if not words or any(word in item.name for word in words)]
+    if not chosen:
+        names = ", ".join(item.name for item in all_items())
+        raise UserError(f"--only {' '.join(words)}: no item has this name. There are: {names}")
+    return chosen
+
+
+def run(slave: Slave, items: Sequence[Item], deviations: Mapping[str, str]) -> Iterator[Result]:
+    """Run the items one after the other. Before each one the slave is reset."""
+    for item in items:
+        begun = time.monotonic()
+        verdict = Verdict.PASSED
+        try:
+            if item.run.__module__ != eds_items.__name__:
+                slave.restart(RESET_NODE)
+            answer = item.run(slave)
+        except Skipped as skipped:
+            answer = str(skipped)
+            verdict = Verdict.SKIPPED
+        except (Wrong, Abort, UnexpectedAnswer) as error:
+            answer = str(error)
+            verdict = Verdict.FAILED
+        except NoAnswer:
+            answer = f"no answer within {slave.limit_s:g} s"
+            verdict = Verdict.FAILED
+        reason = ""
+        if verdict is Verdict.FAILED and item.name in deviations:
+            verdict = Verdict.DEVIATES
+            reason = deviations[item.name]
+        yield Result(item, answer, verdict, reason, time.monotonic() - begun)
+
+
+def counts(results: Sequence[Result]) -> str:
+    """Return the number of items of each verdict in one line."""
+    number = Counter(result.verdict for result in results)
+    parts = [f"{number[verdict]} {verdict.value}" for verdict in Verdict]
+    return f"{len(results)} items: {', '.join(parts)}"
+
+
+def markdown_tables(results: Sequence[Result]) -> Iterator[str]:
+    """Yield the lines of a table for each group of items."""
+    for title, module in GROUPS:
+        rows = [result for result in results if result.item.run.__module__ == module.__name__]
+        if not rows:
+            continue
+        yield f"## {title}"
+        yield ""
+        yield "| item | clause | stimulus | expected | answer | verdict |"
+        yield "|---|---|---|---|---|---|"
+        for result in rows:
+            item = result.item
+            verdict = result.verdict.value
+            if result.reason:
+                verdict += f": {result.reason}"
+            cells = (f"`{item.name}`", item.clause, item.stimulus, item.expected, result.answer)
+            escaped = [cell.replace("|", "\\|") for cell in (*cells, verdict)]
+            yield f"| {' | '.join(escaped)} |"
+        yield ""
+
+
+def junit(results: Sequence[Result], name: str) -> bytes:
+    """Return the results as a JUnit file. Deviations and unsupported services are skipped tests."""
+    number = Counter(result.verdict for result in results)
+    suite = ET.Element(
+        "testsuite",
+        name=name,
+        tests=str(len(results)),
+        failures=str(number[Verdict.FAILED]),
+        skipped=str(number[Verdict.DEVIATES] + number[Verdict.SKIPPED]),
+        errors="0",
+        time=f"{sum(result.seconds for result in results):.3f}",
+    )
+    for result in results:
+        case = ET.SubElement(
+            suite,
+            "testcase",
+            classname=result.item.clause,
+            name=result.item.name,
+            time=f"{result.seconds:.3f}",
+        )
+        detail = f"{result.item.stimulus}: expected {result.item.expected}; {result.answer}"
+        match result.verdict:
+            case Verdict.FAILED:
+                ET.SubElement(case, "failure", message=detail)
+            case Verdict.DEVIATES:
+                ET.SubElement(case, "skipped", message=f"{detail}; {result.reason}")
+            case Verdict.SKIPPED:
+                ET.SubElement(case, "skipped", message=result.answer)
+            case Verdict.PASSED:
+                ET.SubElement(case, "system-out").text = detail
+    ET.indent(suite)
+    return bytes(ET.tostring(suite, encoding="utf-8", xml_declaration=True)) + b"\n"

@@ -1,0 +1,319 @@
+"""SDO server and object dictionary: CiA 301, 7.2.4 and 7.5.2."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.desk.conformance.items import Skipped, item, require, require_abort
+from kontronik_can_gw.desk.conformance.nmt_items import HEARTBEAT_TIME, require_heartbeat
+from kontronik_can_gw.desk.conformance.slave import Abort, Slave, multiplexer, unless_aborted
+
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ODVariable
+
+TOGGLE = 0x05030000
+TIMED_OUT = 0x05040000
+UNKNOWN_COMMAND = 0x05040001
+UNSUPPORTED_ACCESS = 0x06010000
+WRITE_ONLY = 0x06010001
+READ_ONLY = 0x06010002
+NO_OBJECT = 0x06020000
+WRONG_LENGTH = 0x06070010
+TOO_LONG = 0x06070012
+TOO_SHORT = 0x06070013
+NO_SUB_INDEX = 0x06090011
+VALUE_RANGE = 0x06090030
+VALUE_TOO_HIGH = 0x06090031
+VALUE_TOO_LOW = 0x06090032
+_EDS_OBJECT = 0x1021
+_DEVICE_NAME = 0x1008
+
+
+def name_of(variable: "ODVariable") -> str:
+    return f"{variable.index:04X}h:{variable.subindex:02X}"
+
+
+def is_writable(variable: "ODVariable") -> bool:
+    return "w" in variable.access_type
+
+
+def is_readable(variable: "ODVariable") -> bool:
+    return variable.access_type != "wo"
+
+
+def is_number(variable: "ODVariable") -> bool:
+    from canopen.objectdictionary import datatypes
+
+    return variable.data_type in datatypes.INTEGER_TYPES
+
+
+def encoded(variable: "ODVariable", value: int) -> bytes:
+    """Return a number in the size of the entry's data type, also outside its limits."""
+    size = len(variable) // 8
+    return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
+
+
+def first(slave: Slave, condition: Callable[["ODVariable"], bool], what: str) -> "ODVariable":
+    """Return the first entry that meets a condition. Raises Skipped if there is none."""
+    for variable in slave.variables():
+        if condition(variable):
+            return variable
+    raise Skipped(f"the EDS has no {what}")
+
+
+@item("CiA 301, 7.5.2, 1000h", "upload of 1000h", "expedited, 4 bytes, the value of the EDS")
+def sdo_device_type(slave: Slave) -> str:
+    answer = unless_aborted(slave.request(b"\x40" + multiplexer(0x1000, 0)))
+    require(answer[0] == 0x43, f"command specifier {answer[0]:02X}h")
+    value = int.from_bytes(answer[4:], "little")
+    variable = slave.variable(0x1000)
+    expected = None if variable is None else variable.default
+    require(expected is None or value == expected, f"{value:08X}h, and {expected:08X}h in the EDS")
+    return f"{value:08X}h"
+
+
+@item("CiA 301, 7.2.4.3", "upload of an index without an object", "abort 06020000h")
+def sdo_no_object(slave: Slave) -> str:
+    index = next(index for index in range(0x5FFF, 0x2000, -1) if index not in slave.dictionary)
+    return require_abort(lambda: slave.read(index), NO_OBJECT)
+
+
+@item("CiA 301, 7.2.4.3", "upload of sub-index 1 of a VAR", "abort 06090011h")
+def sdo_no_sub_index_of_a_variable(slave: Slave) -> str:
+    return require_abort(lambda: slave.read(0x1000, 1), NO_SUB_INDEX)
+
+
+@item("CiA 301, 7.2.4.3", "upload of a sub-index above the highest one", "abort 06090011h")
+def sdo_no_sub_index_of_a_record(slave: Slave) -> str:
+    highest = max(variable.subindex for variable in slave.variables() if variable.index == 0x1018)
+    return require_abort(lambda: slave.read(0x1018, highest + 1), NO_SUB_INDEX)
+
+
+@item("CiA 301, 7.2.4.3", "download to a read-only object", "abort 06010002h")
+def sdo_write_to_a_read_only_object(slave: Slave) -> str:
+    target = first(slave, lambda v: v.access_type == "ro" and is_number(v), "read-only number")
+    data = bytes(len(target) // 8)
+    return require_abort(lambda: slave.write(target.index, target.subindex, data), READ_ONLY)
+
+
+@item("CiA 301, 7.2.4.3", "download to a constant", "abort 06010002h")
+def sdo_write_to_a_constant(slave: Slave) -> str:
+    def fits(variable: "ODVariable") -> bool:
+        return variable.access_type == "const" and is_number(variable) and len(variable) <= 32
+
+    target = first(slave, fits, "constant number")
+    data = bytes(len(target) // 8)
+    return require_abort(lambda: slave.write(target.index, target.subindex, data), READ_ONLY)
+
+
+@item("CiA 301, 7.2.4.3", "upload of a write-only object", "abort 06010001h")
+def sdo_read_of_a_write_only_object(slave: Slave) -> str:
+    target = first(slave, lambda v: v.access_type == "wo", "write-only object")
+    return require_abort(lambda: slave.read(target.index, target.subindex), WRITE_ONLY)
+
+
+@item("CiA 301, 7.2.4.3", "download of 4 bytes to 1017h", "abort 06070012h or 06070010h")
+def sdo_too_long(slave: Slave) -> str:
+    require_heartbeat(slave)
+    return require_abort(lambda: slave.write(HEARTBEAT_TIME, 0, bytes(4)), TOO_LONG, WRONG_LENGTH)
+
+
+@item("CiA 301, 7.2.4.3", "download of 1 byte to 1017h", "abort 06070013h or 06070010h")
+def sdo_too_short(slave: Slave) -> str:
+    require_heartbeat(slave)
+    return require_abort(lambda: slave.write(HEARTBEAT_TIME, 0, b"\1"), TOO_SHORT, WRONG_LENGTH)
+
+
+@item(
+    "CiA 301, 7.2.4.3; CiA 306",
+    "download of a value above the HighLimit of the EDS",
+    "abort 06090031h or 06090030h",
+)
+def sdo_value_too_high(slave: Slave) -> str:
+    from canopen.objectdictionary import datatypes
+
+    def fits(variable: "ODVariable") -> bool:
+        if not (is_writable(variable) and is_number(variable)) or variable.max is None:
+            return False
+        is_signed = variable.data_type in datatypes.SIGNED_TYPES
+        largest = (1 << len(variable) - is_signed) - 1
+        return variable.max < largest
+
+    target = first(slave, fits, "writable number with a HighLimit")
+    assert target.max is not None
+    value = encoded(target, target.max + 1)
+    return require_abort(
+        lambda: slave.write(target.index, target.subindex, value), VALUE_TOO_HIGH, VALUE_RANGE
+    )
+
+
+@item(
+    "CiA 301, 7.2.4.3; CiA 306",
+    "download of a value below the LowLimit of the EDS",
+    "abort 06090032h or 06090030h",
+)
+def sdo_value_too_low(slave: Slave) -> str:
+    def fits(variable: "ODVariable") -> bool:
+        is_candidate = is_writable(variable) and is_number(variable)
+        return is_candidate and variable.min is not None and variable.min > 0
+
+    target = first(slave, fits, "writable number with a LowLimit")
+    assert target.min is not None
+    value = encoded(target, target.min - 1)
+    return require_abort(
+        lambda: slave.write(target.index, target.subindex, value), VALUE_TOO_LOW, VALUE_RANGE
+    )
+
+
+@item("CiA 301, 7.2.4.3", "download to 1017h, then upload", "the written value")
+def sdo_written_value_is_read_back(slave: Slave) -> str:
+    require_heartbeat(slave)
+    slave.write_number(HEARTBEAT_TIME, 0, 12_345)
+    found = slave.number(HEARTBEAT_TIME)
+    require(found == 12_345, str(found))
+    return str(found)
+
+
+@item("CiA 301, 7.2.4.3.17", "unknown command specifier 7", "abort 05040001h")
+def sdo_unknown_command(slave: Slave) -> str:
+    return require_abort(lambda: unless_aborted(slave.request(b"\xe0")), UNKNOWN_COMMAND)
+
+
+@item("CiA 301, 7.2.4.3.17", "segment request without a transfer", "abort 05040001h")
+def sdo_segment_without_a_transfer(slave: Slave) -> str:
+    return require_abort(lambda: unless_aborted(slave.request(b"\x60")), UNKNOWN_COMMAND)
+
+
+def _segmented(slave: Slave) -> tuple[int, int]:
+    """Return index and sub-index of an object with more than four bytes. Raises Skipped."""
+    for index in (_DEVICE_NAME, 0x1009, 0x100A, _EDS_OBJECT):
+        if slave.has(index) and len(slave.read(index)) > 7:
+            return index, 0
+    raise Skipped("the slave has no text that needs a segmented upload")
+
+
+@item("CiA 301, 7.2.4.3.6", "segmented upload of a text", "as many bytes as announced")
+def sdo_segmented_upload(slave: Slave) -> str:
+    index, sub = _segmented(slave)
+    data = slave.read(index, sub)
+    begin = unless_aborted(slave.request(b"\x40" + multiplexer(index, sub)))
+    require(begin[0] & 0xFE == 0x40, f"command specifier {begin[0]:02X}h")
+    announced = int.from_bytes(begin[4:], "little")
+    slave.send_request(b"\x80" + multiplexer(index, sub) + bytes(4))
+    if begin[0] & 1:
+        require(announced == len(data), f"{announced} announced, {len(data)} received")
+    return f"{len(data)} bytes"
+
+
+@item("CiA 301, 7.2.4.3.17", "segment with the wrong toggle bit", "abort 05030000h")
+def sdo_toggle_bit(slave: Slave) -> str:
+    index, sub = _segmented(slave)
+    unless_aborted(slave.request(b"\x40" + multiplexer(index, sub)))
+    return require_abort(lambda: unless_aborted(slave.request(b"\x70")), TOGGLE)
+
+
+@item("CiA 301, 7.2.4.3.17", "abort by the client, then an upload", "only the upload is answered")
+def sdo_abort_by_the_client(slave: Slave) -> str:
+    index, sub = _segmented(slave)
+    unless_aborted(slave.request(b"\x40" + multiplexer(index, sub)))
+    slave.send_request(b"\x80" + multiplexer(index, sub) + b"\0\0\0\x08")
+    answers = [frame for frame in slave.frames_until_answer() if slave.is_answer(frame)]
+    require(not answers, "the abort was answered")
+    return "only the upload was answered"
+
+
+@item("CiA 301, 7.2.4.3", "a new upload during a segmented upload", "the new upload is answered")
+def sdo_new_transfer_replaces_the_old_one(slave: Slave) -> str:
+    index, sub = _segmented(slave)
+    unless_aborted(slave.request(b"\x40" + multiplexer(index, sub)))
+    slave.read(0x1000)
+    return "it was answered"
+
+
+@item("CiA 301, 7.2.4.3.3", "segmented download of 2 bytes to 1017h", "the value is taken over")
+def sdo_segmented_download(slave: Slave) -> str:
+    require_heartbeat(slave)
+    where = multiplexer(HEARTBEAT_TIME, 0)
+    unless_aborted(slave.request(b"\x21" + where + b"\2\0\0\0"))
+    answer = unless_aborted(slave.request(b"\x0b" + (4321).to_bytes(2, "little")))
+    require(answer[0] == 0x20, f"command specifier {answer[0]:02X}h")
+    found = slave.number(HEARTBEAT_TIME)
+    require(found == 4321, str(found))
+    return str(found)
+
+
+@item(
+    "CiA 301, 7.2.4.3.14",
+    "block upload with CRC",
+    "the data of a segmented upload, and its CRC",
+)
+def sdo_block_upload(slave: Slave) -> str:
+    index, sub = _segmented(slave)
+    plain = slave.read(index, sub)
+    begin = slave.request(b"\xa4" + multiplexer(index, sub) + b"\x7f")
+    try:
+        unless_aborted(begin)
+    except Abort as abort:
+        if abort.code in (UNKNOWN_COMMAND, UNSUPPORTED_ACCESS):
+            raise Skipped(f"no block transfer ({abort})") from None
+        raise
+    data = b""
+    slave.send_request(b"\xa3")
+    while True:
+        number = 0
+        while number < 0x7F:
+            part = slave.wait_for(slave.is_answer).data
+            number += 1
+            require(part[0] & 0x7F == number, f"segment {part[0] & 0x7F} instead of {number}")
+            data += part[1:]
+            if part[0] & 0x80:
+                break
+        confirmation = bytes((0xA2, number, 0x7F))
+        if part[0] & 0x80:
+            break
+        slave.send_request(confirmation)
+    end = unless_aborted(slave.request(confirmation))
+    require(end[0] & 0xE3 == 0xC1, f"command specifier {end[0]:02X}h at the end")
+    unused = end[0] >> 2 & 7
+    data = data[: len(data) - unused]
+    slave.send_request(b"\xa1")
+    require(data == plain, f"{len(data)} bytes, which differ from the segmented upload")
+    if begin[0] & 4:
+        crc = int.from_bytes(end[1:3], "little")
+        require(crc == _crc16(data), f"CRC {crc:04X}h instead of {_crc16(data):04X}h")
+    return f"{len(data)} equal bytes" + (", CRC right" if begin[0] & 4 else ", without CRC")
+
+
+def _crc16(data: bytes) -> int:
+    """Return the CRC of block transfers: polynomial 1021h, start value 0 (CiA 301, 7.2.4.3.16)."""
+    remainder = 0
+    for byte in data:
+        remainder ^= byte << 8
+        for _ in range(8):
+            remainder <<= 1
+            if remainder & 0x10000:
+                remainder ^= 0x11021
+    return remainder
+
+
+@item(
+    "CiA 301, 7.2.4.3",
+    "requests of 0 to 7 bytes, then an upload",
+    "no answer or an abort for each, and an answer to the upload",
+)
+def sdo_short_request(slave: Slave) -> str:
+    whole = b"\x40" + multiplexer(0x1001, 0) + bytes(3)
+    for size in range(8):
+        slave.send(0x600 + slave.node_id, whole[:size])
+    answers = [frame for frame in slave.frames_until_answer() if slave.is_answer(frame)]
+    good = [frame for frame in answers if frame.data[:1] == b"\x80"]
+    require(answers == good, f"{len(answers) - len(good)} were answered like whole requests")
+    return f"{len(good)} aborts, {8 - len(good)} ignored, the upload was answered"
+
+
+@item("CiA 301, 7.2.4.3", "SDO request with a 29-bit id", "no answer")
+def sdo_extended_frame_is_ignored(slave: Slave) -> str:
+    request = b"\x40" + multiplexer(0x1001, 0) + bytes(4)
+    slave.send(0x600 + slave.node_id, request, extended=True)
+    answers = [frame for frame in slave.frames_until_answer() if slave.is_answer(frame)]
+    require(not answers, "it was answered")
+    return "no answer"
