@@ -40,8 +40,10 @@ from kontronik_can_gw.times import MS
 REQUIRED = MISSING
 """Default of a key that must be given."""
 REMOVED_KEYS: dict[str, str] = {
-    "statistics.prometheus": "`kontronik-can-gw metrics` serves /metrics; `sudo systemctl enable --now kontronik-can-gw-metrics`.",
-    "record.can_log": "`kontronik-can-gw convert CAPTURE flight.log` makes the log from a capture.",
+    "statistics.prometheus": "Use `kontronik-can-gw metrics`, which serves /metrics: "
+    "`sudo systemctl enable --now kontronik-can-gw-metrics`.",
+    "record.can_log": "Use `kontronik-can-gw convert CAPTURE flight.log`, "
+    "which makes the log from a capture.",
 }
 """For removed keys, as "record.can_log", a sentence about the replacement.
 

@@ -13,7 +13,7 @@ _TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
     "boolean": (bool, "true or false"),
     "integer": (int, "a whole number"),
     "number": ((int, float), "a number"),
-    "string": (str, "a text"),
+    "string": (str, "a string"),
     "object": (dict, "a table"),
 }
 
@@ -80,7 +80,7 @@ def integer(low: int, high: int, also: int | None = None) -> Kind:
         schema["maximum"] = also
         schema["not"] = {"exclusiveMinimum": high, "exclusiveMaximum": also}
         span = f"{span}, {also}"
-        problem = f"{problem} and not {also}"
+        problem = f"is neither in {low}..{high} nor {also}"
     return _plain(span, problem, **schema)
 
 
@@ -113,7 +113,7 @@ def choice_of(known: Callable[[], Sequence[str]], span: str = "") -> Kind:
         text = _check_type(value, "string")
         if text not in known():
             near = did_you_mean(text, known(), 0.5, or_known=True)
-            raise ValueError(f"{text!r} is not known here.{near}")
+            raise ValueError(f"unknown value {text!r}.{near}")
         return str(text)
 
     span = span or ", ".join(f'"{text}"' for text in known())
@@ -122,7 +122,7 @@ def choice_of(known: Callable[[], Sequence[str]], span: str = "") -> Kind:
 
 def meanings(known: Sequence[str]) -> Kind:
     """Accept a table that maps each of the user's texts to one of the known texts."""
-    return table_of(choice_of(lambda: known, "texts"))
+    return table_of(choice_of(lambda: known, "strings"))
 
 
 def table_of(kind: Kind) -> Kind:
@@ -149,11 +149,11 @@ def options(path: str, own: frozenset[str]) -> Kind:
 
     def entry(value: Any) -> Any:
         if not isinstance(value, (str, int, float)):
-            raise ValueError(f"{value!r} is not a text, a number or a boolean")
+            raise ValueError(f"{value!r} is not a string, a number or a boolean")
         return value
 
     kind = table_of(
-        Kind("texts, numbers or booleans", {"type": ["string", "number", "boolean"]}, entry)
+        Kind("strings, numbers or booleans", {"type": ["string", "number", "boolean"]}, entry)
     )
 
     def check(value: Any) -> Any:
@@ -161,7 +161,7 @@ def options(path: str, own: frozenset[str]) -> Kind:
         misplaced = sorted(own & set(checked))
         if misplaced:
             name = misplaced[0]
-            raise ValueError(f"{name} has its own key: {path}.{name}")
+            raise ValueError(f"{name} cannot be set here. Use {path}.{name}.")
         return checked
 
     return Kind(kind.span, kind.schema | {"propertyNames": {"not": {"enum": sorted(own)}}}, check)
@@ -183,7 +183,7 @@ def _check_ratio(value: Any) -> Fraction:
 
 def _check_names(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list):
-        raise ValueError(f'{value!r} is not a list of names, as ["Motor_*"]')
+        raise ValueError(f'{value!r} is not a list of names such as ["Motor_*"]')
     return tuple(TEXT.check(name) for name in value)
 
 
@@ -210,12 +210,12 @@ def _check_bindings(value: Any) -> Any:
 
 
 BOOLEAN = _plain("boolean", type="boolean")
-TEXT = pattern("string", r"[^\x00]*[^\x00\s][^\x00]*", "is not a text")
+TEXT = pattern("string", r"[^\x00]*[^\x00\s][^\x00]*", "is blank or contains a NUL character")
 _RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
 _RATIO_NUMBER = {"type": "number", "minimum": 0.001, "maximum": 1000}
 _RATIO_TEXT = {"type": "string", "pattern": f"^{_RATIO}$"}
 RATIO = Kind("0.001 … 1000", {"anyOf": [_RATIO_NUMBER, _RATIO_TEXT]}, _check_ratio)
-NAMES = Kind("list of texts", {"type": "array", "items": TEXT.schema}, _check_names)
+NAMES = Kind("list of strings", {"type": "array", "items": TEXT.schema}, _check_names)
 _SOURCES = table_of(
     Kind("sources or numbers", {"anyOf": [TEXT.schema, {"type": "number"}]}, _check_source)
 )
@@ -228,13 +228,13 @@ _PORT = "(6553[0-5]|655[0-2][0-9]|65[0-4][0-9]{2}|6[0-4][0-9]{3}|[1-5][0-9]{4}|[
 BROKER = pattern(
     "host or host:port",
     rf"([A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|\[[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*\])(:{_PORT})?",
-    "is not a broker, as broker.example, 192.168.1.5:1883 or [fe80::1]:1883",
+    "is not a broker address such as broker.example, 192.168.1.5:1883 or [fe80::1]:1883",
     maxLength=200,
 )
 TOPIC = pattern(
-    "text without + and #",
+    "string without + and #",
     r"[^\s\x00+#/$][^\x00-\x1f\x7f+#/]*(/[^\x00-\x1f\x7f+#/]+){0,7}",
-    "is not the beginning of topics, as kontronik or fleet/north: no + and #, no / at the ends",
+    "is not a topic prefix such as kontronik or fleet/north. Do not use + or #, or / at the ends.",
     maxLength=200,
 )
 LEVEL = pattern(
@@ -245,7 +245,7 @@ LEVEL = pattern(
 NODE_NAME = pattern(
     "string",
     r"[a-z0-9_-]+(\.[a-z0-9_-]+)*",
-    "is not a name of small letters, digits, - and _, with dots in between, of at most 60",
+    "is not a name of 1 to 60 lower-case letters, digits, - and _, with single dots in between",
     maxLength=60,
 )
 ESC_NAME = pattern(

@@ -49,13 +49,15 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
         advice = " `kontronik-can-gw init` writes an example." if missing else ""
         raise UserError(f"{path}: cannot be read: {error.strerror}.{advice}") from None
     except UnicodeDecodeError:
-        raise UserError(f"{path}: is not a text file in UTF-8, so no TOML configuration") from None
+        raise UserError(
+            f"{path}: is not a UTF-8 text file, so it cannot be a TOML configuration"
+        ) from None
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         # TOMLDecodeError is a ValueError. A number of 5000 digits raises ValueError, and 1000
         # nested brackets raise RecursionError.
-        reason = "a number in it is too long, or it is nested too deep"
+        reason = "a number is too long, or the nesting is too deep"
         if isinstance(error, tomllib.TOMLDecodeError):
             reason = str(error)
         raise UserError(f"{path}: is not valid TOML: {reason}") from None
@@ -77,7 +79,7 @@ def _make_config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, l
     }
     listed = tables.get("esc", [])
     if not isinstance(listed, list) or not all(isinstance(entry, dict) for entry in listed):
-        problems.append("esc: is written [[esc]], once for each ESC")
+        problems.append("esc: must be written [[esc]], once for each ESC")
         listed = []
     elif not listed:
         problems.append(
@@ -105,7 +107,7 @@ def _make_table(given: Any, name: str, place: str, problems: list[str], removed:
     Adds mistakes to ``problems``, and a line for each removed key to ``removed``.
     """
     if not isinstance(given, dict):
-        problems.append(f"{place}: is a table, written [{place}]")
+        problems.append(f"{place}: must be a table, written [{place}]")
         return None
     before = len(problems)
     kinds = {row.name: row.metadata["kind"] for row in fields(TABLES[name])}
@@ -138,12 +140,12 @@ def _esc_problems(escs: Mapping[int, EscConfig]) -> Iterator[str]:
     names = {number: normalize(esc.name) for number, esc in escs.items()}
     ports = {number: esc.port for number, esc in escs.items()}
     for number, other in _duplicates(names):
-        yield f"esc[{number}].name: {escs[number].name!r} is also that of esc[{other}]"
+        yield f"esc[{number}].name: {escs[number].name!r} is already used by esc[{other}]"
     for number, other in _duplicates(ports):
-        yield f"esc[{number}].port: {escs[number].port!r} is also that of esc[{other}]"
+        yield f"esc[{number}].port: {escs[number].port!r} is already used by esc[{other}]"
     for number, esc in escs.items():
         if esc.device is not None and esc.device_number is None:
-            yield f"esc[{number}].device: {esc.device!r} is no device of the protocol {esc.protocol}"
+            yield f"esc[{number}].device: {esc.device!r} is not a device of the protocol {esc.protocol}"
     for number, esc in escs.items():
         if _is_ambiguous(names[number], {"", *names.values()}):
             yield (
@@ -204,13 +206,13 @@ def _node_id_problems(config: Config) -> Iterator[str]:
         if node_id == UNCONFIGURED:
             if config.canopen.read_only:
                 yield (
-                    f"esc[{number}]: waits for a node-ID by LSS, which canopen.read_only = true refuses. "
-                    "Give it a node_id."
+                    f"esc[{number}]: would wait for a node-ID by LSS, "
+                    "which canopen.read_only = true refuses. Set its node_id."
                 )
         elif not 1 <= node_id <= 127:
             yield (
                 f"esc[{number}]: its node-ID would be {node_id}. "
-                "Choose a smaller canopen.node_id, or a node_id for it."
+                "Choose a smaller canopen.node_id, or set its node_id."
             )
         elif number in duplicates:
-            yield f"esc[{number}].node_id: {node_id} is also that of esc[{duplicates[number]}]"
+            yield f"esc[{number}].node_id: {node_id} is already used by esc[{duplicates[number]}]"

@@ -27,9 +27,9 @@ The limit of SAE J1939's transport protocol is 1785, of a CAN FD frame 64.
 """
 _MAX_BITS = _MAX_MESSAGE_BYTES * 8
 _MAX_NESTING = 8
-_PAGES = "number of multiplexer values in all"
+_PAGES = "total number of multiplexer values"
 _PAGE = "multiplexer value"
-_TABLES = "length of the value tables that VAL_ names, in characters"
+_TABLES = "total length of the value tables of VAL_, in characters"
 _LIMITS = {
     "CAN id": 0xFFFF_FFFF,
     "length in bytes": _MAX_MESSAGE_BYTES,
@@ -84,13 +84,13 @@ def check_bounds(text: str, path: str) -> None:
     found = _MANY_DIGITS.search(text)
     if found:
         raise UserError(
-            f"{path}: line {_line(text, found)}: a number of more than {_MAX_DIGITS} digits. "
+            f"{path}: line {_line(text, found)}: a number has more than {_MAX_DIGITS} digits. "
             "Correct it."
         )
     for kind, number, where in _numbers(text):
         if not 0 <= number <= _LIMITS[kind]:
             raise UserError(
-                f"{path}: {where}{kind} is {number}, not 0 to {_LIMITS[kind]}. Correct it."
+                f"{path}: {where}{kind} is {number}, but must be 0 to {_LIMITS[kind]}. Correct it."
             )
 
 

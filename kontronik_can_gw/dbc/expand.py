@@ -92,8 +92,9 @@ def _chosen(database: "Database", node: str, patterns: Sequence[str], file: str)
             continue
         hint = did_you_mean(pattern, others if node == NO_NODE else ours)
         for name in fnmatch.filter(others, pattern)[:1]:
-            hint = f" {name} is sent by {', '.join(others[name].senders) or 'nobody'}."
-        problems.append(f"dbc.messages: {pattern!r} is no message of {node} in {file}.{hint}")
+            senders = ", ".join(others[name].senders)
+            hint = f" {name} is sent by {senders}." if senders else f" {name} has no transmitter."
+        problems.append(f"dbc.messages: {pattern!r} matches no message of {node} in {file}.{hint}")
     if problems:
         raise UserError(*problems)
     chosen.update(others)
@@ -110,7 +111,7 @@ def _problems(copies: Sequence[Copy], node: str) -> Iterator[str]:
             outside.append(f"{copy.frame_id:X}h")
     if outside:
         problem = f"{len(outside)} of {len(ours)} ids are out of range: {listed(outside)}."
-        yield f"{problem} Take fewer ESCs or another dbc.base_id."
+        yield f"{problem} Use fewer ESCs or another dbc.base_id."
     names = []
     for copy in copies:
         if copy.prefix:
@@ -118,8 +119,9 @@ def _problems(copies: Sequence[Copy], node: str) -> Iterator[str]:
             names += [name for _, name in copy.signals()]
     too_long = [name for name in names if len(name) > MAX_NAME]
     if too_long:
-        problem = f"longer than {MAX_NAME} characters with the ESC's name in front"
-        yield f"{problem}: {listed(too_long)}. Shorten the name of the ESC, or those in the DBC."
+        problem = f"longer than {MAX_NAME} characters with the ESC's name as prefix"
+        remedy = "Shorten the name of the ESC, or the names in the DBC."
+        yield f"{problem}: {listed(too_long)}. {remedy}"
 
 
 def _step(ids: Sequence[tuple[int, bool, bool]], count: int, wanted: int | None, file: str) -> int:
@@ -140,10 +142,9 @@ def _step(ids: Sequence[tuple[int, bool, bool]], count: int, wanted: int | None,
             return step
     if wanted is not None:
         raise UserError(
-            f"{file}: with ids moved by {wanted} an ESC, ids of {count} ESCs clash. "
-            "Take another step."
+            f"{file}: with dbc.id_step = {wanted} the ids of {count} ESCs clash. "
+            "Choose another step."
         )
     raise UserError(
-        f"{file}: no step moves the ids for {count} ESCs without a clash. "
-        "Give the messages other ids."
+        f"{file}: no dbc.id_step separates the ids of {count} ESCs. Change the ids of the messages."
     )

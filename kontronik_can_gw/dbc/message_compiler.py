@@ -88,11 +88,11 @@ def _frame_problems(job: Compilation, message: "Message", where: str) -> Iterato
         )
     if _is_fd(message) and message.length not in FD_LENGTHS:
         lengths = ", ".join(map(str, FD_LENGTHS[9:]))
-        yield f"{where}: CAN FD has no frames of {message.length} bytes, but {lengths}."
+        yield f"{where}: CAN FD has no frames of {message.length} bytes. Use one of {lengths}."
     if _is_empty(message):
         yield (
-            f"{where}: has no signal that could be sent. "
-            "Give it signals, or leave it out (dbc.messages)."
+            f"{where}: has no signals to send. "
+            "Add signals, or exclude the message with dbc.messages."
         )
 
 
@@ -100,9 +100,9 @@ def _too_many_pages(message: "Message", count: int) -> str | None:
     """Return the problem of a message whose multiplexing is not supported. None if it is."""
     multiplexers = [signal for signal in message.signals if signal.is_multiplexer]
     if len(multiplexers) > 1 or any(signal.multiplexer_ids for signal in multiplexers):
-        return "has more than one level of multiplexing; one is supported."
+        return "has more than one level of multiplexing. Only one is supported."
     if count > _MAX_PAGES:
-        return f"has {count} multiplexer values; {_MAX_PAGES} are supported."
+        return f"has {count} multiplexer values. At most {_MAX_PAGES} are supported."
     return None
 
 
@@ -139,14 +139,14 @@ def _page_problems(
             largest = -1 if multiplexer.is_float else raw_range(multiplexer)[1]
             for page in pages:
                 if page > largest:
-                    problem = f"cannot hold the multiplexer value {page} (m{page})."
+                    problem = f"cannot represent the multiplexer value {page} (m{page})."
                     yield f"{where}.{multiplexer.name}: {problem}"
     for signal in signals:
         if signal.page is not None and signal.role in (Role.ALIVE, Role.CRC):
             yield (
-                f"{where}.{signal.name}: is a multiplexed {signal.role.value}; "
-                "it has to be in every frame. "
-                f"Take the m{signal.page} away, or bind it to a constant."
+                f"{where}.{signal.name}: is a multiplexed {signal.role.value}, "
+                "but must be in every frame. "
+                f"Remove its m{signal.page}, or bind it to a constant."
             )
 
 
@@ -180,21 +180,21 @@ def _crc_problems(
     key = f"dbc.e2e_data_ids.{copy.name} = 0x{copy.frame_id & 0xFFFF:X}"
     if not is_configured and not (fits and has_known_names):
         yield (
-            f"{where}.{crc.name}: the DBC does not say how this checksum is made. "
-            "AUTOSAR E2E profile 1 (8 bits on a byte border, "
-            f"beside exactly one alive counter, 0 to 14) is chosen by {key}. "
-            "Otherwise bind it to a constant, if receivers take "
-            "one, or leave the message out (dbc.messages)."
+            f"{where}.{crc.name}: the DBC does not define how this checksum is computed. "
+            "For AUTOSAR E2E profile 1 (8 bits on a byte boundary, and exactly one alive counter "
+            f"from 0 to 14 in the message) set {key}. "
+            "Otherwise bind it to a constant, if receivers accept one, "
+            "or exclude the message with dbc.messages."
         )
         return
     if not fits:
-        yield f"{where}.{crc.name}: an E2E profile 1 CRC needs 8 bits on a byte border."
+        yield f"{where}.{crc.name}: an E2E profile 1 CRC needs 8 bits on a byte boundary."
     if not has_counter:
         problem = "E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
         yield f"{where}: {crc.name}: {problem}"
     if not is_configured:
         job.warnings.append(
-            f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. If that is right, say so: {key}"
+            f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. To confirm this, set {key}"
         )
 
 
@@ -220,9 +220,8 @@ def _timing(job: Compilation, message: "Message", where: str) -> tuple[SendType,
     name = job.settings.send_type.get(text, _meanings().get(normalize(text)))
     if name is None:
         job.problems.append(
-            f"{where}: GenMsgSendType {text!r} is not known. Say what it means: "
-            f"dbc.send_type.{text!r} = "
-            f"one of {', '.join(SEND_TYPES)}."
+            f"{where}: unknown GenMsgSendType {text!r}. "
+            f"Set dbc.send_type.{text!r} to its meaning: {', '.join(SEND_TYPES)}."
         )
         return SendType.EVENT, cycle, delay
     if name == _BY_CYCLE:
@@ -231,8 +230,8 @@ def _timing(job: Compilation, message: "Message", where: str) -> tuple[SendType,
     send_type = SEND_TYPES[name]
     if SendType.CYCLIC in send_type and not cycle:
         job.problems.append(
-            f"{where}: is sent {text} but its GenMsgCycleTime is 0. "
-            f'Set one in ms, or dbc.send_type.{text!r} = "Event".'
+            f"{where}: is sent {text}, but its GenMsgCycleTime is 0. "
+            f'Set a time in ms, or dbc.send_type.{text!r} = "Event".'
         )
     return send_type, cycle, delay
 
@@ -250,9 +249,9 @@ def _time(job: Compilation, message: "Message", name: str, where: str) -> int:
         if found < 0:
             raise ValueError
     except (ValueError, OverflowError, ZeroDivisionError):
-        job.problems.append(f"{where}: {name} is {str(value)[:40]!r}, which is no time in ms.")
+        job.problems.append(f"{where}: {name} is {str(value)[:40]!r}, which is not a time in ms.")
         return 0
     if 0 < found < MS:
-        job.warnings.append(f"{where}: {name} is {value} ms; 1 ms is used, the shortest time.")
+        job.warnings.append(f"{where}: {name} is {value} ms. The shortest time is used, 1 ms.")
         return MS
     return found

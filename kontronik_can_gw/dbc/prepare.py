@@ -61,10 +61,10 @@ def prepare(
     job.problems += _unused_settings(job, ours, node)
     if len(job.unbound) > _MANY:
         job.problems.append(
-            f"{file}: {len(job.unbound)} signals of {node} are bound to nothing. "
-            "dbc.messages chooses messages, as "
-            f'["{ours[0].message.name}", "Esc*"]; '
-            'dbc.unbound = "start_value" sends what is not bound as a constant.'
+            f"{file}: {len(job.unbound)} signals of {node} have no source. "
+            "Choose the messages to send with dbc.messages, for example "
+            f'["{ours[0].message.name}", "Esc*"], '
+            'or send such signals as constants with dbc.unbound = "start_value".'
         )
     if job.problems:
         raise UserError(*dict.fromkeys(job.problems))
@@ -119,7 +119,7 @@ def _clashes(
         senders = copy.message.senders
         if same_id is not copy and node in (*senders, *same_id.message.senders):
             yield (
-                f"{file}: {copy.name}: id {copy.frame_id:X}h is also that of {same_id.name}. "
+                f"{file}: {copy.name}: id {copy.frame_id:X}h is already used by {same_id.name}. "
                 "Change one of them."
             )
         if same_name is not copy and node in (*senders, *same_name.message.senders):
@@ -134,7 +134,7 @@ def _clashes(
         if user is not None:
             yield (
                 f"{file}: {copy.name}: id {copy.frame_id:X}h is used by {taken[user]}. "
-                f"Move the message (free for all: 680h..6DFh) or change the node-ID."
+                f"Move the message (always free: 680h..6DFh) or change the node-ID."
             )
 
 
@@ -169,7 +169,7 @@ def _timing_warnings(job: Compilation, plans: Sequence[MessagePlan]) -> Iterator
     once = [plan.name for plan in plans if not plan.cycle_ns and not plan.paces]
     if once:
         yield (
-            f"{job.file}: sent once at the start, without a cycle and a value that changes: "
+            f"{job.file}: sent only once, at the start, without a cycle time or a changing value: "
             f"{listed(once)}"
         )
 
@@ -203,8 +203,8 @@ def check_load(
     if worst <= WARN_LOAD:
         return None
     if round(worst, 2) > round(load, 2):
-        text += f", and {worst:.0%} while everything changes that is sent on change"
-    return f"{text}; other nodes get little"
+        text += f", and up to {worst:.0%} while all values sent on change keep changing"
+    return f"{text}. Little is left for other nodes"
 
 
 def is_mute(signal: SignalPlan) -> bool:
@@ -249,7 +249,7 @@ def unreported(layout: Layout, silent_on_loss: bool) -> list[str]:
             found.append(
                 f"{layout.file}: {message.name}: without telemetry {listed(flags, 3)} are sent "
                 "as if they were known, and no signal "
-                "of the message reports the loss. Add one bound to link_state, or with "
+                "of the message reports the loss. Add a signal bound to link_state, or one with "
                 f"NotAvailable in its value table{remedy}."
             )
     return found
@@ -268,7 +268,8 @@ def unsupplied(layout: Layout, escs: Sequence[EscSettings]) -> list[str]:
         if names:
             found.append(
                 f"{layout.file}: {message.name}: {listed(names, 3)}: "
-                f"not supplied by the protocol {' or '.join(sorted(protocols))}, never available. "
-                "A flag, which has no code for that, is sent as 0 or its start value."
+                f"never available, because the protocol {' or '.join(sorted(protocols))} "
+                "does not supply them. "
+                "A flag has no code for this: it is sent as 0 or its start value."
             )
     return found

@@ -85,7 +85,7 @@ def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> 
     if len(raw) > MAX_BYTES:
         raise UserError(
             f"{path}: is larger than {MAX_BYTES // 1_000_000} MB. "
-            "Is it a DBC? Give one with fewer comments."
+            "Is it a DBC? If so, remove comments."
         )
     if b"\0" in raw:
         raise UserError(f"{path}: is a binary file, not a DBC")
@@ -102,18 +102,18 @@ def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> 
     rewriting = _Rewriting(text, path)
     if warnings is not None:
         for reason, entries in rewriting.ignored.items():
-            warnings.append(f"{path}: ignored, {reason}: {listed(entries)}")
+            warnings.append(f"{path}: ignored entries {reason}: {listed(entries)}")
     try:
         database = cantools.database.load_string(
             rewriting.result, database_format="dbc", strict=False, sort_signals=None
         )
     except Exception as error:  # cantools raises errors of many types for other text than a DBC
         reason = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
-        raise UserError(f"{path}: is not a DBC that can be read: {reason}") from None
+        raise UserError(f"{path}: cannot be read as a DBC: {reason}") from None
     if not isinstance(database, cantools.database.Database):
         raise UserError(f"{path}: is not a CAN database")
     if not database.messages:
-        raise UserError(f"{path}: has no message; is it a DBC file?")
+        raise UserError(f"{path}: has no messages. Is it a DBC?")
     return database
 
 
@@ -152,7 +152,7 @@ class _Rewriting:
                 raise UserError(
                     f"{self._path}: {message}.{found['signal']}: "
                     f"byte order {found['order']} is neither 0 (Motorola) nor "
-                    "1 (Intel). Write @0 or @1; a float is declared by SIG_VALTYPE_."
+                    "1 (Intel). Write @0 or @1. SIG_VALTYPE_ declares floats."
                 )
 
     def _mask(self, found: re.Match[str]) -> str:
@@ -192,7 +192,7 @@ class _Rewriting:
             if keyword != "VAL_" or not re.fullmatch(r"[A-Za-z_]\w*", table):
                 return found[0]
             if table not in tables:
-                reason = "naming a VAL_TABLE_ that is not in the file"
+                reason = "that name a VAL_TABLE_ that is not in the file"
                 return self._remove(found, reason, f"{entry} {table}")
             return f"{found['head']}{tables[table]};"
 
@@ -205,7 +205,7 @@ class _Rewriting:
         def rewritten(found: re.Match[str]) -> str:
             if self._unmask(found[2]) in defined:
                 return found[0]
-            reason = "of attributes that no BA_DEF_ defines"
+            reason = "of attributes without a BA_DEF_"
             return self._remove(found, reason, f"{found[1]} {found[2]}")
 
         return _ATTRIBUTE.sub(rewritten, text)
@@ -236,7 +236,7 @@ class _Rewriting:
             if value not in numbers[name]:
                 known = listed(numbers[name])
                 raise UserError(
-                    f"{self._path}: attribute {name}: {value} is none of its values {known}"
+                    f"{self._path}: attribute {name}: {value} is not one of its values: {known}"
                 )
             return f"{found[1]}{found[2]}{found[3]}{numbers[name][value]}{found[5]}"
 
@@ -273,22 +273,20 @@ def choose_node(
         if wanted in senders:
             return wanted
         raise UserError(
-            f"{file}: no message is sent by node {wanted!r}; nodes that send: "
-            f"{', '.join(senders) or 'none'}. "
-            f"Set dbc.node to one of them."
+            f"{file}: node {wanted!r} sends no messages. "
+            f"Nodes that send messages: {', '.join(senders) or 'none'}."
         )
     if not senders:
         raise UserError(
-            f"{file}: no message has a transmitter, so none is ours. "
-            "Select messages by dbc.messages, or name a transmitter "
-            "in the DBC (BU_ and BO_)."
+            f"{file}: no message has a transmitter, so none is sent. "
+            "Choose messages with dbc.messages, or name a transmitter in the DBC (BU_ and BO_)."
         )
     if len(senders) == 1:
         return senders[0]
     if "KontronikGateway" in senders:
         return "KontronikGateway"
     raise UserError(
-        f"{file}: several nodes send: {', '.join(senders)}. Set dbc.node to the gateway's."
+        f"{file}: several nodes send messages: {', '.join(senders)}. Set dbc.node to the gateway's."
     )
 
 

@@ -78,19 +78,19 @@ class SignalCompiler:
         length = signal.length
         entries = self.table.entries
         if signal.is_float and length not in (32, 64):
-            raise UnfitSignal(f"a float of {length} bits cannot be sent; 32 and 64 can.")
+            raise UnfitSignal(f"a float of {length} bits is not supported. Use 32 or 64 bits.")
         if signal.is_float:
             if any(float_bits(raw, length) is None for raw in entries):
                 raise UnfitSignal(
-                    f"has a value table with numbers that no {length}-bit float holds."
+                    f"its value table has numbers that a {length}-bit float cannot represent."
                 )
             return
         low, high = raw_range(signal)
         outside = [f"{raw} {text!r}" for raw, text in entries.items() if not low <= raw <= high]
         if outside:
             raise UnfitSignal(
-                f"cannot hold {', '.join(outside)} of its value table; "
-                f"its values are {low} to {high}."
+                f"cannot represent {', '.join(outside)} of its value table. "
+                f"Its raw values are {low} to {high}."
             )
 
     def _scale(self) -> tuple[Fraction, Fraction, tuple[Fraction, Fraction] | None]:
@@ -110,7 +110,9 @@ class SignalCompiler:
             for limit in limits or ():
                 float(limit)
         except ValueError:
-            raise UnfitSignal("has a factor, offset or limit that is no finite number.") from None
+            raise UnfitSignal(
+                "has a factor, offset or limit that is not a finite number."
+            ) from None
         except OverflowError:
             raise UnfitSignal("has a factor, offset or limit that is too large.") from None
         return factor, offset, limits
@@ -191,7 +193,7 @@ class SignalCompiler:
         if isinstance(bound, (int, float)):
             constant = raw_values.constant(self.signal, bound, plan.factor, plan.offset)
             if constant is None:
-                raise UnfitSignal(f"the constant {bound} bound to it cannot be sent exactly.")
+                raise UnfitSignal(f"cannot represent its constant {bound} exactly.")
             return replace(plan, constant=constant)
         name = self.signal.name if bound is None else bound
         found = self.job.binder.by_name(name, self.copy.esc)
@@ -201,8 +203,8 @@ class SignalCompiler:
         if role is not None:
             if role is Role.ALIVE and (plan.is_float or plan.low > 0 or plan.high < 2):
                 raise UnfitSignal(
-                    "an alive counter needs a whole number of 2 bits or more that begins at 0. "
-                    "Or bind it to a constant."
+                    "an alive counter must be an integer of at least 2 bits with a minimum of 0. "
+                    "Otherwise bind it to a constant."
                 )
             return replace(plan, role=role)
         if bound is None and self.job.settings.unbound == "start_value":
@@ -217,10 +219,12 @@ class SignalCompiler:
         escs = self.job.binder.escs
         if esc is None and value.group is not Group.GATEWAY:
             examples = " or ".join(f"{e.name}.{value.name}" for e in escs[:2])
-            raise UnfitSignal(f"does not say of which ESC. Prefix it or bind it: {examples}.")
+            raise UnfitSignal(
+                f"does not name its ESC. Add a prefix or bind it, for example to {examples}."
+            )
         plan = _bound_plan(plan, self.table, value, self._flag_on_loss())
         if value.unit and not plan.unit:
-            self.job.warnings.append(f"{self._where}: has no unit; {value.unit} is taken.")
+            self.job.warnings.append(f"{self._where}: has no unit, so {value.unit} is assumed.")
         return replace(plan, esc=esc)
 
     def _start_value(self, plan: SignalPlan) -> int:
@@ -234,8 +238,7 @@ class SignalCompiler:
             return 0
         if self.start_raw is None:
             raise UnfitSignal(
-                f"its GenSigStartValue {self.start} is none of its raw values. "
-                "Bind it to a constant."
+                f"cannot represent its GenSigStartValue {self.start}. Bind it to a constant."
             )
         return self.start_raw
 
@@ -273,7 +276,7 @@ def _bound_plan(
         counts = slope == 1 and intercept == 0 and low == 0 and high >= 1
         if plan.is_float or not counts:
             raise UnfitSignal(
-                f"{value.name} is a counter; it needs factor 1, offset 0 and a minimum of 0."
+                f"{value.name} is a counter, which needs factor 1, offset 0 and a minimum of 0."
             )
         notes.append(f"starts again at 0 after {high}")
     has_no_code = not plan.is_float and table.not_available is None
@@ -288,9 +291,10 @@ def _scale(plan: SignalPlan, value: Value) -> tuple[Fraction, Fraction]:
     converted = units.conversion(value.unit, plan.unit)
     if converted is None:
         can = ", ".join(units.texts_like(value.unit))
+        unit = f"is in {value.unit}" if value.unit else "has no unit"
         raise UnfitSignal(
-            f"{value.name} is in {value.unit or 'no unit'} and cannot be converted to "
-            f"{plan.unit!r}. Possible: {can}; dbc.units says what other texts mean."
+            f"{value.name} {unit} and cannot be converted to {plan.unit!r}. "
+            f"Possible units: {can}. For another spelling, set dbc.units."
         )
     scale, shift = converted
     slope = scale / value.per_unit / plan.factor
@@ -301,9 +305,9 @@ def _scale(plan: SignalPlan, value: Value) -> tuple[Fraction, Fraction]:
 def _notes_on_names(value: Value, numbers: Mapping[int, int]) -> Iterator[str]:
     missing = [text for number, text in value.names.items() if number not in numbers]
     if value.names and not numbers:
-        yield "the value table has no name of it: sent as the ESC's number"
+        yield "the value table has none of its names, so the ESC's number is sent"
     elif missing:
-        yield f"sent as Error, not in the value table: {', '.join(missing)}"
+        yield f"sent as Error, because missing in the value table: {', '.join(missing)}"
 
 
 def _flag(plan: SignalPlan, on_loss: int | None) -> SignalPlan:
@@ -312,7 +316,7 @@ def _flag(plan: SignalPlan, on_loss: int | None) -> SignalPlan:
     raws = [math.floor(value * plan.slope + plan.intercept + half) for value in (0, 1)]
     if any(not plan.low <= raw <= plan.high and raw != plan.error for raw in raws):
         sign = " Make it unsigned." if plan.signed else ""
-        raise UnfitSignal(f"cannot hold both values of a flag, 0 and 1.{sign}")
+        raise UnfitSignal(f"cannot represent both values of a flag, 0 and 1.{sign}")
     if on_loss is None:
         return plan
     code = raws[on_loss]

@@ -155,7 +155,7 @@ def test_the_usual_and_the_worst_bus_load_are_shown(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", [f"x = {'9' * 5000}", f"x = {'[' * 5000}"])
 def test_toml_beyond_the_limits_of_python_is_explained_to_users(text: str, tmp_path: Path) -> None:
     said = refused(2, "check", written(tmp_path / "g.toml", text))
-    assert said.endswith("is not valid TOML: a number in it is too long, or it is nested too deep")
+    assert said.endswith("is not valid TOML: a number is too long, or the nesting is too deep")
 
 
 @pytest.mark.parametrize(

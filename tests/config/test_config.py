@@ -144,7 +144,7 @@ TWO_ON_ONE_PORT = [{"port": "a"}, {"port": "a"}]
 OTHERS: list[tuple[dict[str, Any], list[str]]] = [
     (
         {"statistics": {"file": "my.dbc"}} | escs({"name": "x"}, {"name": "X"}),
-        ["esc[2].name: 'X' is also", "statistics.file", BAD_DBC],
+        ["esc[2].name: 'X' is already used", "statistics.file", BAD_DBC],
     ),
     (
         {"canopen": {"node_id": 127, "eds": "none.eds"}, "esc": TWO_ON_ONE_PORT},
@@ -218,7 +218,7 @@ def test_removed_key_is_a_warning_with_place_and_replacement(
     assert config.can == without.can
     assert jsonschema.Draft202012Validator(schema()).is_valid(old)
     assert "queue" not in as_toml(config)
-    assert problems(old | {"run": 1}) == ["a.toml: run: is a table, written [run]"]
+    assert problems(old | {"run": 1}) == ["a.toml: run: must be a table, written [run]"]
     for key, advice in REMOVED_KEYS.items():
         table, _, name = key.partition(".")
         assert table in KEYS, key

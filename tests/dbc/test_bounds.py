@@ -11,7 +11,7 @@ from kontronik_can_gw.errors import UserError
 
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n'
 ONE = 'BO_ 1 Msg: 8 A\n SG_ s : 0|8@1+ (1,0) [0|0] "" A\n'
-IN_ALL = "number of multiplexer values in all is"
+IN_ALL = "total number of multiplexer values is"
 PAGED = (
     'BO_ 1 Msg: 8 A\n SG_ m M : 0|32@1+ (1,0) [0|0] "" A\n SG_ s m0 : 32|8@1+ (1,0) [0|0] "" A\n'
 )
@@ -35,9 +35,12 @@ def nested(depth: int, width: int) -> str:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (ONE.replace(": 8", ": 400000000"), "Msg: length in bytes is 400000000, not 0 to 4095"),
+        (
+            ONE.replace(": 8", ": 400000000"),
+            "Msg: length in bytes is 400000000, but must be 0 to 4095",
+        ),
         (ONE.replace("|8@", "|4294967295@"), "Msg.s: length in bits is 4294967295"),
-        (ONE.replace(": 0|", ": -1|"), "Msg.s: start bit is -1, not 0 to 32759"),
+        (ONE.replace(": 0|", ": -1|"), "Msg.s: start bit is -1, but must be 0 to 32759"),
         (ONE.replace("BO_ 1", "BO_ 99999999999"), "Msg: CAN id is 99999999999"),
         (PAGED.replace("m0", "m99999999999"), "Msg.s: multiplexer value is 99999999999"),
         (PAGED + "SG_MUL_VAL_ 1 s m 0-3000000;", f"SG_MUL_VAL_ of s: {IN_ALL} 3000001"),
@@ -49,12 +52,12 @@ def nested(depth: int, width: int) -> str:
         (ONE + ONE.partition("\n")[2] * 4_096, "Msg: number of signals is 4097"),
         ("BU_:" + " A" * 2_001, "number of nodes is 2001"),
         ("BO_ 1 Msg: 8 A\n" + " ," * 500_000, "more than 500000 words"),
-        (ONE.replace("(1,", f"({'1' * 5000},"), "line 6: a number of more than 400 digits"),
+        (ONE.replace("(1,", f"({'1' * 5000},"), "line 6: a number has more than 400 digits"),
         (ATTRIBUTE + 'BA_ "GenMsgCycleTime" BO_ 1 1e999999999;', "line 6: exponent is 999999999, "),
         (ATTRIBUTE + 'BA_DEF_DEF_ "GenMsgCycleTime" " 1e99_999";', "line 6: exponent is 99999, "),
         (
             'VAL_TABLE_ T 0 "' + "x" * 10_000 + '";\n' + "VAL_ 1 s T;\n" * 801,
-            "tables that VAL_ names",
+            "value tables of VAL_",
         ),
         (" " * MAX_BYTES, "is larger than 8 MB"),
     ],

@@ -77,7 +77,7 @@ def test_an_attribute_with_a_text_that_its_enumeration_lacks_is_refused() -> Non
         'BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic";\nBA_ "GenMsgSendType" BO_ 256 "Sometimes";\n'
     )
     (line,) = refused(STATE + text)
-    assert '"GenMsgSendType": "Sometimes" is none of' in line
+    assert '"GenMsgSendType": "Sometimes" is not one of' in line
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ GATEWAYS: dict[str, Any] = {"node": "Gateway", "unbound": "start_value"}
 
 def test_a_pattern_without_a_message_of_this_gateway_is_refused() -> None:
     lines = refused(ECU, messages=["Motr_11", "Motor_11", "Motor_9*", "qqq*"], **GATEWAYS)
-    words = "is no message of Gateway in my_car.dbc."
+    words = "matches no message of Gateway in my_car.dbc."
     assert lines == [
         f"dbc.messages: 'Motr_11' {words} Did you mean Motor_11?",
         f"dbc.messages: 'Motor_9*' {words} Motor_90 is sent by Other.",
@@ -214,8 +214,9 @@ def test_an_unbound_signal_has_its_start_value_as_cantools_reads_it() -> None:
     for plan in layout.messages:
         shown |= {signal.name: held(signal) for signal in plan.signals if signal.unbound}
     assert shown == {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}
-    assert [line for line in layout.warnings if "sent once" in line] == [
-        "my_car.dbc: sent once at the start, without a cycle and a value that changes: Motor_21"
+    assert [line for line in layout.warnings if "sent only once" in line] == [
+        "my_car.dbc: sent only once, at the start, without a cycle time or a changing value: "
+        "Motor_21"
     ]
 
 
@@ -269,7 +270,7 @@ def test_a_send_type_is_recognised_by_each_of_its_usual_names(meant: str) -> Non
 @pytest.mark.parametrize("text", ["No", "Wrong", "OnRequest", "cyclically"])
 def test_an_unknown_send_type_is_refused_unless_dbc_send_type_defines_it(text: str) -> None:
     (line,) = refused(all_sent(text))
-    assert f"GenMsgSendType {text!r} is not known" in line
+    assert f"unknown GenMsgSendType {text!r}" in line
     assert f"dbc.send_type.{text!r}" in line
     for name, meaning in ((text, "CyclicAndEvent"), ("OnChange", "Event")):
         (plan,) = compiled(all_sent(name), send_type={name: meaning}).messages
@@ -455,7 +456,7 @@ def test_each_flag_needs_a_signal_of_its_own_esc_to_report_the_loss() -> None:
 def test_a_float_of_24_bits_is_refused_even_with_a_start_value() -> None:
     float_24 = signal("Throttle", "0|24@1-", "%") + "SIG_VALTYPE_ 256 Throttle : 1;\n"
     (line,) = refused(MESSAGE + float_24 + START + start_of("Throttle", 5))
-    assert "a float of 24 bits cannot be sent" in line
+    assert "a float of 24 bits is not supported" in line
 
 
 def test_a_capture_stores_the_dbc_settings_and_0_5_0_stored_fewer() -> None:
@@ -508,7 +509,7 @@ def test_an_unknown_byte_order_is_refused_with_the_name_of_the_signal(
     (line,) = refused(STATE.replace("@1", f"@{order}"))
     assert line == (
         f"{FILE}: Power.OperatingState: byte order {said} is neither 0 (Motorola) nor 1 (Intel). "
-        "Write @0 or @1; a float is declared by SIG_VALTYPE_."
+        "Write @0 or @1. SIG_VALTYPE_ declares floats."
     )
 
 
@@ -533,16 +534,16 @@ def test_messages_without_a_transmitter_are_selected_by_name(
 
 def test_messages_without_a_transmitter_need_a_selection_and_a_match() -> None:
     (line,) = refused(HEAD + UNSENT)
-    assert "Select messages by dbc.messages, or name a transmitter" in line
+    assert "Choose messages with dbc.messages, or name a transmitter" in line
     (line,) = refused(HEAD + UNSENT, messages=("ESC_4",))
-    assert line.startswith("dbc.messages: 'ESC_4' is no message of")
+    assert line.startswith("dbc.messages: 'ESC_4' matches no message of")
     assert "ESC_" in line[-30:]
 
 
 def test_a_message_with_a_transmitter_is_not_selected_by_name_alone() -> None:
     text = HEAD + UNSENT + "BO_ 700 Theirs: 8 Other\n" + signal("BatteryVoltage")
     (line,) = refused(text, messages=("ESC_1",))
-    assert "ESC_1 is sent by nobody" in line
+    assert "ESC_1 has no transmitter" in line
 
 
 @pytest.mark.parametrize("kind", ["FLOAT 0 65535", "INT 0 65535", "STRING"])
@@ -563,7 +564,7 @@ def test_a_cycle_time_with_a_fraction_is_exact_or_causes_a_warning(
     )
     layout = compiled(STATE + text)
     assert layout.messages[0].cycle_ns == used_ns
-    said = [f"{FILE}: Power: GenMsgCycleTime is 0.25 ms; 1 ms is used, the shortest time."]
+    said = [f"{FILE}: Power: GenMsgCycleTime is 0.25 ms. The shortest time is used, 1 ms."]
     assert [line for line in layout.warnings if "CycleTime" in line] == said * (written == "0.25")
 
 

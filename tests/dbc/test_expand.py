@@ -198,7 +198,7 @@ def test_ids_are_moved_by_the_smallest_step_without_a_clash(
 @pytest.mark.parametrize(
     ("text", "escs", "more", "words"),
     [
-        (simple(0x100, 0x101), PAIR, {"id_step": 1}, "moved by 1"),
+        (simple(0x100, 0x101), PAIR, {"id_step": 1}, "dbc.id_step = 1 "),
         (simple(0x100, gateway=(0x110,)), PAIR, {"id_step": 0x10}, "clash"),
         (simple(0x100), PAIR, {"id_step": 0}, "clash"),
         (simple(0x7FF), PAIR, {}, "1 of 2 ids are out of range: 800h"),

@@ -61,7 +61,7 @@ def test_a_start_value_that_is_not_a_number_is_ignored() -> None:
 # --- values that a signal cannot hold
 
 CODES = {255: "NotAvailable", 254: "Error"}
-NO_NAMES = "the value table has no name of it: sent as the ESC's number"
+NO_NAMES = "the value table has none of its names, so the ESC's number is sent"
 
 
 def volts(length: int, factor: str, **more: Any) -> Sig:
@@ -81,7 +81,7 @@ def volts(length: int, factor: str, **more: Any) -> Sig:
         (Sig("OperatingState", 0, 8, texts={1: "Asleep"} | CODES), [NO_NAMES]),
         (Sig("LinkState", 0, 8,
              texts={9: "Ok", 8: "LOST", 7: "Searching", 6: "never_seen"} | CODES),
-         ["sent as Error, not in the value table: Degraded, PortError"]),
+         ["sent as Error, because missing in the value table: Degraded, PortError"]),
         (Sig("Undervoltage", 0, 1), ["not available is sent as 0"]),
         # a source without names leaves a value table alone
         (Sig("CellCount", 0, 8, texts={0: "unknown", 6: "six"} | CODES), []),
@@ -211,7 +211,7 @@ def test_the_worst_load_causes_a_warning_and_the_usual_load_a_refusal() -> None:
     layout = layout_of(message, CYCLIC_AND_ON_CHANGE, 20)
     assert check_load(layout, 50 * 3 * 135 * 2) is None
     warning = str(check_load(layout, 50 * 2 * 135))
-    words = "need 50% of 13 kbit/s, and 150% while everything changes that is sent on change"
+    words = "need 50% of 13 kbit/s, and up to 150% while all values sent on change keep changing"
     assert words in warning
     with pytest.raises(UserError, match="need 101%"):
         check_load(layout, 50 * 135 * 100 // 101)
@@ -220,7 +220,7 @@ def test_the_worst_load_causes_a_warning_and_the_usual_load_a_refusal() -> None:
     worst = {"the CANopen nodes": 6_000.0}
     assert check_load(empty, 10_000, further=further) is None
     loaded = check_load(empty, 10_000, 0, further, worst)
-    assert "need 10% of 10 kbit/s, and 60% while" in str(loaded)
+    assert "need 10% of 10 kbit/s, and up to 60% while" in str(loaded)
 
 
 def test_the_bits_of_canopen_nodes_are_counted_too() -> None:

@@ -117,8 +117,8 @@ def test_missing_flag_is_not_read_as_no_error() -> None:
     column = columns.index(("undervoltage", 1))
     first, values = (reader.read(258, bytes(8)) or [])[0]
     assert values[column - first] is None
-    (warning,) = [line for line in loaded.warnings if "not supplied by" in line]
-    words = "KissMore: KissBecVoltage, KissUndervoltage: not supplied by the protocol kiss"
+    (warning,) = [line for line in loaded.warnings if "never available" in line]
+    words = "KissMore: KissBecVoltage, KissUndervoltage: never available, because the protocol kiss"
     assert words in warning
 
 
@@ -199,8 +199,8 @@ def test_line_is_set_without_parity() -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"protocol": "kiss", "device": "KOSMIK"}, "'KOSMIK' is no device of the protocol kiss"),
-        ({"protocol": "kis"}, "'kis' is not known here. Did you mean kiss?"),
+        ({"protocol": "kiss", "device": "KOSMIK"}, "'KOSMIK' is not a device of the protocol kiss"),
+        ({"protocol": "kis"}, "unknown value 'kis'. Did you mean kiss?"),
     ],
 )
 def test_invalid_key_of_its_configuration_is_refused(wrong: dict[str, str], said: str) -> None:
