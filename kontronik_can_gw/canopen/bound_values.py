@@ -205,7 +205,7 @@ def _compile(mapped: Sequence[Variable]) -> SlotPlan:
     for variable, signal in zip(mapped, plan.signals, strict=True):
         bound = variable.bound
         if bound is None:
-            only_python = f"{variable.entry.index:04X}h is no value of an ESC"
+            only_python = f"{variable.entry.index:04X}h is not a value of an ESC"
             if variable.read is not None:
                 # the error register and the error code, which are bound to a service
                 status.append(signal)

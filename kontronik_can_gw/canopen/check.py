@@ -75,7 +75,7 @@ def _missing(entries: Mapping[Place, Entry]) -> Iterator[str]:
             needed.add((index - MAPPING + COMMUNICATION, 0))
         needed.add((index, 0))
     for index, sub in sorted(needed - entries.keys()):
-        yield f"{index:04X}h:{sub:02X} is mandatory and is not there. Add it."
+        yield f"{index:04X}h:{sub:02X} is mandatory but missing. Add it."
 
 
 def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
@@ -88,10 +88,10 @@ def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
             for problem in _unlike(entry, reference):
                 yield entry, problem
         elif index < 0x2000:
-            yield entry, "this node has no such service. Remove the object."
+            yield entry, "the gateway's nodes do not have this service. Remove the object."
         first = _SERVER.get((index, sub))
         if first is not None and not (entry.default == first and entry.relative):
-            yield entry, f"must be $NODEID+0x{first:X}: the SDO server has no other."
+            yield entry, f"must be $NODEID+0x{first:X}, the COB-ID of the SDO server."
         # sub-index 0 of the history and of mappings is a number that changes
         is_count = index == 0x1003 or index in _MAPPINGS
         last = highest[index]
@@ -135,7 +135,7 @@ def _unlike(entry: Entry, shipped: Entry) -> Iterator[str]:
         if kind in SIGNED or TYPE_BITS[kind] < bits:
             yield f"must be of an unsigned type of {bits} bits or more."
     if "w" not in shipped.access and "w" in entry.access and index not in _PLAIN:
-        yield "is shown by the node, so it must be read only (AccessType=ro or const)."
+        yield "must be read only (AccessType=ro or const), because only the node writes it."
 
 
 def _settings(
@@ -152,7 +152,7 @@ def _settings(
             low = low if entry.low is None else entry.low
             high = high if entry.high is None else entry.high
             if not low <= value <= high:
-                problem = f"cannot hold {value}, which the configuration says of {esc.name}."
+                problem = f"cannot hold {value}, the configured value of {esc.name}."
                 yield entry, f"{problem} Use a larger DataType or limit."
 
 
@@ -183,9 +183,9 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
             parameters = f"{tpdo.communication_index:04X}h and {tpdo.mapping_index:04X}h"
             yield (
                 f"TPDO {tpdo.number + 1}: the defaults of {parameters} "
-                f"do not make a PDO of node {node_id} ({error}). "
-                "Map objects with PDOMapping=1, in their own lengths, 64 bits in all, "
-                "at a COB-ID that is free."
+                f"are not a valid PDO of node {node_id} ({error}). "
+                "Map objects with PDOMapping=1, in their own lengths, at most 64 bits in total, "
+                "and use a free COB-ID."
             )
 
 
@@ -202,6 +202,6 @@ def _shared_ids(dictionary: Dictionary, node_ids: Sequence[int]) -> Iterator[str
                 continue
             named.add((other_index, index))
             yield (
-                f"COB-ID {cob_id:03X}h is that of {other_user} and of {user}. "
+                f"COB-ID {cob_id:03X}h is used by {other_user} and by {user}. "
                 "Change one DefaultValue (or add $NODEID)."
             )

@@ -105,11 +105,11 @@ def _about(nodes: Nodes, escs: Sequence[EscSettings]) -> str:
     if described:
         parts.append(f"Active transmit PDOs, heartbeat and emergencies of {', '.join(described)}.")
     if waiting:
-        parts.append(f"Waiting for a node-ID by LSS, so without frames: {', '.join(waiting)}.")
+        parts.append(f"No frames yet, because LSS must assign a node-ID: {', '.join(waiting)}.")
     parts.append(
         "PDOs are sent while a node is Operational. "
         "All bits set (signed: only the sign bit set) means NotAvailable. "
-        "If a master changes the mapping of PDOs, write this file again."
+        "If a master changes the PDO mapping, generate this file again."
     )
     return " ".join(parts)
 
@@ -217,7 +217,7 @@ def _emergency(node: Node) -> MessageRow:
     about_word = (
         "Error word of the ESC, or the detail of an emergency of the gateway. "
         "TelemetryFault: 1 telemetry lost, 2 CRC errors, 3 port gone, "
-        "4 other device than configured. HeartbeatLost: the node-ID."
+        "4 not the configured device. HeartbeatLost: the node-ID."
     )
     word = unsigned_signal(
         "EmergencyWord",
@@ -228,7 +228,7 @@ def _emergency(node: Node) -> MessageRow:
     )
     about = (
         f"Emergencies of CANopen node {node.node_id}, "
-        "sent when an error comes, NoError when all are gone."
+        "sent when an error begins. NoError is sent when all errors have ended."
     )
     return _message(
         "Emergency",
@@ -266,7 +266,7 @@ def _tpdo(tpdo: Tpdo, node: Node) -> MessageRow:
         schedule = _Schedule(send_type, cycle_ms, tpdo.inhibit_ns // MS)
     else:
         schedule = _Schedule("None")
-        which = f"every SYNC number {tpdo.type}" if tpdo.type else "a SYNC when there is news"
+        which = f"every SYNC number {tpdo.type}" if tpdo.type else "the next SYNC after a change"
         comment += f" Sent at {which}."
     return _message(
         f"Tpdo{number}",

@@ -27,7 +27,7 @@ _MIRRORS = 0x6000
 _NOTES = {
     "peak_current": " A held maximum that does not fall back when the motor stops.",
     "bec_current": " Not supplied by a JIVEPro.",
-    "firmware": " Main version times 256, and the sub version.",
+    "firmware": " Main version times 256 plus sub version.",
     "data_age": " 65534 means this age or more.",
     "info_age": " 65534 means this age or more.",
 }

@@ -131,6 +131,6 @@ def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
     text = value.decode(coding)
     is_plain = text.isascii() and text.isprintable()
     if not is_plain or bare(f"={text}")[1:].strip() != text:
-        problem = f"the text {text!r} of {entry.name} cannot stand in a DCF."
+        problem = f"the text {text!r} of {entry.name} cannot be written in a DCF."
         raise UserError(f"{name}: {entry.place} {problem}")
     return text

@@ -121,7 +121,7 @@ class Section:
             return otherwise
         number = integer(text)
         if number is None:
-            raise ValueError(f"{self.quoted(key)}: not a number. Write 0x1F or 31.")
+            raise ValueError(f"{self.quoted(key)}: not a number. Use the form 0x1F or 31.")
         return number
 
 
@@ -139,7 +139,7 @@ def read_sections(data: bytes, problems: list[str]) -> dict[str, Section]:
             section = Section(to_ascii(heading[1].strip()))
             where = f"[{section.name}] "
             if sections.setdefault(_spelling(section.name), section) is not section:
-                problems.append(f"{where}this section is there twice. Remove one.")
+                problems.append(f"{where}this section occurs twice. Remove one.")
             continue
         text = bare(line)
         if text:
@@ -156,12 +156,12 @@ def _read_key(
     key, equals, value = (part.strip() for part in text.partition("="))
     if not value.isascii():
         if key.lower() in _EXACT_KEYS:
-            yield f"{_quoted(text)} has letters beyond ASCII. Write it in plain letters."
+            yield f"{_quoted(text)} has characters outside ASCII. Use ASCII only."
         value = to_ascii(value)
     if not (equals and key and has_heading):
         yield f"'{_quoted(text)}' is neither a section, nor key=value, nor a comment after ';'."
     elif key.lower() in section.keys:
-        yield f"{_quoted(key)}: this key is there twice. Remove one."
+        yield f"{_quoted(key)}: this key occurs twice. Remove one."
     else:
         section.set(key, value)
 
@@ -258,8 +258,8 @@ def load(data: bytes, name: str) -> Eds:
     text = decode_text(data[: MAX_BYTES + 1]).lower()
     if not any(section in text for section in known):
         raise UserError(
-            f"{name}: is no EDS: "
-            "it has none of the sections [FileInfo], [DeviceInfo], [MandatoryObjects]."
+            f"{name}: is not an EDS: "
+            "it has no section [FileInfo], [DeviceInfo] or [MandatoryObjects]."
         )
     if len(data) > MAX_BYTES:
         raise UserError(f"{name}: is larger than {MAX_BYTES // 1_000_000} MB. Is it an EDS?")
@@ -298,11 +298,11 @@ def _entry_sections(
 ) -> Iterator[tuple[int, int, Section]]:
     """Yield index, sub-index and section of each entry, and add mistakes to ``problems``."""
     if "devicecomissioning" in sections:
-        problem = "this is a DCF, the file of one node. Give the EDS it was made from."
+        problem = "this is a DCF, the file of one node. Use the EDS from which it was made."
         problems.append(f"[DeviceComissioning] {problem}")
     device_info = sections.get("deviceinfo", Section(""))
     if _is_set(device_info, "CompactPDO"):
-        problem = "not supported. Describe each PDO by its own sections and write 0."
+        problem = "not supported. Describe each PDO in its own sections and set this to 0."
         problems.append(f"[DeviceInfo] CompactPDO: {problem}")
     for index, subs in sorted(_objects(sections).items()):
         head = sections.get(f"{index:04x}")
@@ -312,7 +312,7 @@ def _entry_sections(
         elif _is_set(head, "CompactSubObj"):
             problem = (
                 "CompactSubObj: not supported. "
-                "Let the EDS editor expand it, a section for each sub-index."
+                "Let the EDS editor expand it into a section for each sub-index."
             )
             problems.append(f"[{head.name}] {problem}")
         else:
@@ -345,7 +345,7 @@ def _entry(section: Section, index: int, sub: int) -> Entry:
     data_type = section.number("DataType", DOMAIN_TYPE if is_domain else 0)
     if data_type not in TYPE_NAMES:
         known = ", ".join(f"0x{code:X} {name}" for code, name in TYPE_NAMES.items())
-        raise ValueError(f"{section.quoted('DataType')}: not supported. Take one of {known}.")
+        raise ValueError(f"{section.quoted('DataType')}: not supported. Use one of {known}.")
     access = section.get("AccessType").lower() or ("rw" if is_domain else "")
     if access not in _ACCESS:
         raise ValueError(f"{section.quoted('AccessType')}: not one of {', '.join(_ACCESS)}.")
@@ -398,7 +398,7 @@ def _fitting(
     """
     number = integer(text)
     if number is None:
-        raise ValueError(f"{section.quoted(key)}: not a number. Write 0x1F or 31.")
+        raise ValueError(f"{section.quoted(key)}: not a number. Use the form 0x1F or 31.")
     low, high = range_of(data_type)
     is_hexadecimal = "x" in text.lower()
     if data_type in SIGNED and is_hexadecimal and high < number <= high - low:
@@ -424,7 +424,7 @@ def _default(
         try:
             return bytes.fromhex(text), False
         except ValueError:
-            problem = "not bytes. Write pairs of hexadecimal digits, or nothing."
+            problem = "not bytes. Write pairs of hexadecimal digits, or leave it empty."
             raise ValueError(f"DefaultValue={text}: {problem}") from None
     if data_type in FLOATS:
         return _real(text, data_type), False
@@ -446,4 +446,4 @@ def _real(text: str, data_type: int) -> float:
         number: float = codec.unpack(bits.to_bytes(codec.size, "little"))[0]
         return number
     except (ValueError, OverflowError):
-        raise ValueError(f"DefaultValue={text}: not a number. Write 1.5.") from None
+        raise ValueError(f"DefaultValue={text}: not a number. Use the form 1.5.") from None

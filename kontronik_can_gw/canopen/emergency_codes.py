@@ -65,10 +65,10 @@ class GatewayError(Enum):
     PORT_GONE = (0x7510, 3, "serial port gone",
         ("Check the USB adapter and its plug. The gateway retries by itself. "
          "kontronik-can-gw doctor shows details."))
-    OTHER_DEVICE = (0x7510, 4, "another device than esc.device",
-        "Check which ESC is plugged in where, or correct esc.device in the configuration.")
+    OTHER_DEVICE = (0x7510, 4, "not the device of esc.device",
+        "Check which ESC is connected to which port, or correct esc.device in the configuration.")
     RECEIVE_OVERRUN = (0x8110, 0, "received CAN frames were lost",
-        "Let masters send less at once, and look for a device that floods the bus.")
+        "Let masters send fewer frames at once, and look for a device that floods the bus.")
     CAN_PASSIVE = (0x8120, 0, "CAN controller error passive",
         ("Check bit rate, termination (120 ohm at both ends) and cables of the bus. "
          "Check that another node is switched on."))
@@ -78,8 +78,8 @@ class GatewayError(Enum):
         "Look for a short, a wrong bit rate or a bad cable on the bus.")
     ID_COLLISION = (0x8150, 0,
         "another device sends with an id of this node: two nodes with one node-ID?",
-        "Give each node of the bus another node-ID, and each message another id.")
-    SYNC_LENGTH = (0x8240, 0, "SYNC of a wrong length",
+        "Give each node on the bus its own node-ID, and each message its own id.")
+    SYNC_LENGTH = (0x8240, 0, "SYNC with a wrong length",
         ("Configure the master to send SYNC as 1019h defines it: "
          "without data, or with one byte if it has a counter."))
     PARAMETER_FILE = (0x6300, 0, "the parameter file could not be read, so defaults are used",

@@ -172,8 +172,8 @@ class CanopenSetup(OutputSetup):
             for number in to_ignore:
                 name = self.escs[number].name
                 warnings.append(
-                    f"{name}: the stored node-ID and COB-IDs are ignored: "
-                    "one of them is used otherwise now"
+                    f"{name}: the stored node-ID and COB-IDs are ignored, "
+                    "because one of them now has another user"
                 )
                 kept[number] = kept[number].without_ids()
             setup = replace(setup, stored=tuple(kept))
@@ -254,7 +254,7 @@ def configured(config: Config, machine: Machine) -> CanopenSetup:
     if canopen.serial is None and not machine.identity:
         note = (
             "this machine has no id, so serial numbers (1018h:4) are 0 "
-            "and LSS cannot distinguish the nodes: set canopen.serial"
+            "and LSS cannot distinguish the nodes. Set canopen.serial"
         )
         notes = (note,)
     nothing_stored = (Stored(),) * len(settings)
@@ -270,7 +270,7 @@ def _read_eds(config: Config, machine: Machine) -> Eds:
         data = machine.read_file(path, limit)
     except OSError as error:
         raise UserError(
-            f"{path}: cannot be read: {error.strerror}. canopen.eds names the EDS file."
+            f"{path}: cannot be read: {error.strerror}. Set canopen.eds to an EDS file."
         ) from None
     eds = eds_of(data, str(path))
     reference = _reference(eds, path, machine)

@@ -113,15 +113,15 @@ def decode(data: bytes) -> Stored:
         raise ValueError("the file is empty")
     header = _HEADER.match(data)
     if header is None:
-        raise ValueError("the first line is not that of a parameter file")
+        raise ValueError("the first line is not the header of a parameter file")
     version = int(header[1])
     if version != VERSION:
         raise ValueError(
-            f"format version {version} is unknown, this program knows version {VERSION}"
+            f"format version {version} is not supported. This program supports version {VERSION}"
         )
     body = data[header.end() :]
     if int(header[2] or b"-1", 16) != zlib.crc32(body):
-        raise ValueError("the content does not fit its CRC-32: damaged or truncated")
+        raise ValueError("the content does not match its CRC-32: damaged or truncated")
     try:
         content = json.loads(body)
         communication = _values(content["communication"])
@@ -131,7 +131,7 @@ def decode(data: bytes) -> Stored:
             return stored
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         pass  # written by hand or by another program, because the CRC fits
-    raise ValueError("the content is not in the form in which this program writes it")
+    raise ValueError("the content was not written by this program")
 
 
 def _is_node_id(value: object) -> bool:

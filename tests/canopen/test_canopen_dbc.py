@@ -232,7 +232,7 @@ def test_the_dbc_has_the_timing_of_pdos_at_syncs_and_disabled_messages() -> None
     }
     comments = {m.frame_id: str(m.comment) for m in db.messages}
     assert "every SYNC number 3" in comments[0x181]
-    assert "at a SYNC when there is news" in comments[0x281]
+    assert "at the next SYNC after a change" in comments[0x281]
     assert "only the boot-up message" in comments[0x701]
     assert bench.write(0x1014, 0, 0x80000081, size=4) is None
     assert "EscEmergency" not in described(bench)
@@ -305,5 +305,5 @@ def test_a_node_that_waits_for_lss_has_no_frames_and_causes_a_warning(
     assert "right_r: no node-ID yet (LSS gives one), so no frames to describe" in said
     db = read(text)
     assert {message.name[:4] for message in db.messages} == {"Left"}
-    assert "Waiting for a node-ID by LSS, so without frames: right_r." in str(db.buses[0].comment)
+    assert "No frames yet, because LSS must assign a node-ID: right_r." in str(db.buses[0].comment)
     assert read(described(dialogue.Bench(node_ids=(255,)))).messages == []

@@ -80,12 +80,12 @@ DAMAGED = [
     (b"node_id = 5\n", "first line"),
     (BODY, "first line"),
     (HEADER, "CRC-32"),
-    (with_crc(content(), version=2), "version 2 is unknown"),
-    (FUTURE, "version 12 is unknown"),
+    (with_crc(content(), version=2), "version 2 is not supported"),
+    (FUTURE, "version 12 is not supported"),
     (with_crc(content(), version='"1"'), "first line"),
     (with_crc(content()).replace(b"\n", b"\r\n"), "CRC-32"),
 ]
-FORM = "form"  # the reason for every content with the right CRC
+FORM = "not written by this program"  # the reason for every content with the right CRC
 OTHER_CONTENT: list[Any] = [
     b"\xff\xfe\n",
     "[" * 100_000,

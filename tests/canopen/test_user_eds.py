@@ -134,11 +134,11 @@ def test_a_damaged_file_is_either_read_or_refused(data: st.DataObject) -> None:
 def test_cob_ids_of_one_node_and_of_missing_objects_are_checked() -> None:
     text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080")
     (said,) = problems(dcf.without(text.encode(), {0x1014}), 1)
-    assert "COB-ID 081h is that of 1014h:00 of node 1 and of 1800h:01 of node 1." in said
+    assert "COB-ID 081h is used by 1014h:00 of node 1 and by 1800h:01 of node 1." in said
     text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
     assert problems(text, 1) == ()
     said = problems(text, 3)[0]
-    assert "TPDO 1: the defaults of 1800h and 1A00h do not make a PDO of node 3" in said
+    assert "TPDO 1: the defaults of 1800h and 1A00h are not a valid PDO of node 3" in said
     assert problems(SHIPPED, *range(1, 128)) == ()
 
 
@@ -148,7 +148,7 @@ def test_a_configured_setting_that_does_not_fit_its_object_is_refused() -> None:
         text = with_key(text, "2100sub4", key, value)
     assert problems(text, 1) == ()
     eds = reader.load(text.encode(), "my.eds")
-    said = "2100h:04 Telemetry time-out: cannot hold 5000, which the configuration says"
+    said = "2100h:04 Telemetry time-out: cannot hold 5000, the configured value of b"
     with pytest.raises(UserError, match=said):
         check_eds(eds, shipped_eds(), [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
 
@@ -233,7 +233,7 @@ def test_signed_limits_and_keys_without_a_value_are_read() -> None:
 )
 def test_a_text_that_a_dcf_cannot_contain_is_refused(value: bytes) -> None:
     eds = reader.load(SHIPPED.encode(), "kontronik_esc.eds")
-    expected = r"kontronik_esc\.eds: 2010h:06 the text .* of Device name cannot stand"
+    expected = r"kontronik_esc\.eds: 2010h:06 the text .* of Device name cannot be written"
     with pytest.raises(UserError, match=expected):
         dcf.dcf(
             eds,
@@ -395,8 +395,8 @@ def test_a_default_text_with_other_letters_is_refused() -> None:
     text = with_object(variable(9, DefaultValue="Gr\u00fc\u00dfe"))
     (found,) = problems(text.encode("latin-1"))
     assert found == (
-        "mine.eds: [2200] DefaultValue=Gr\\xfc\\xdfe has letters beyond ASCII. "
-        "Write it in plain letters."
+        "mine.eds: [2200] DefaultValue=Gr\\xfc\\xdfe has characters outside ASCII. "
+        "Use ASCII only."
     )
 
 
