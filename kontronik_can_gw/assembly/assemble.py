@@ -112,13 +112,13 @@ def check_devices(config: Config) -> None:
         other = ports.setdefault(real, esc.name)
         if other != esc.name:
             problems.append(
-                f"{config.file}: the ports of {other} and {esc.name} are one device, {real}"
+                f"{config.file}: the ports of {other} and {esc.name} are the same device, {real}"
             )
     channel = os.path.realpath(config.can.channel.partition("@")[0])
     if "/" in config.can.channel and channel in ports:
         problems.append(
-            f"{config.file}: can.channel {config.can.channel} is the port of {ports[channel]}: "
-            "nothing may be sent to an ESC."
+            f"{config.file}: can.channel {config.can.channel} is the port of {ports[channel]}. "
+            "Nothing may be sent to an ESC."
         )
     if problems:
         raise UserError(*problems)

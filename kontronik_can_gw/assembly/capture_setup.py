@@ -125,7 +125,7 @@ class CaptureSetup:
         version = header.get("version")
         if version not in VERSIONS:
             raise HeaderError(
-                f"capture version {version} is unknown, this program knows versions up to {VERSION}"
+                f"capture version {version} is not supported, only versions up to {VERSION}"
             )
         try:
             with reading("the header"):
@@ -175,7 +175,7 @@ def _outputs_of(header: Header, escs: Sequence[EscSettings]) -> tuple[OutputSetu
     found = dict(header.get("outputs", {}))
     for name in found:
         if name not in OUTPUTS or name in _IN_HEADER:
-            raise HeaderError(f"{str(name)[:40]!r} is no output that this version knows")
+            raise HeaderError(f"{str(name)[:40]!r} is not an output of this version")
     for name in _IN_HEADER:
         if header[name] is not None:
             found[name] = header[name]
@@ -213,8 +213,8 @@ def _check(header: Header) -> None:
     whole_number(header.get("part", 0), 0, 1 << 32)
     for name, part_type in _TYPES.items():
         if not isinstance(header.get(name, part_type()), part_type):
-            raise HeaderError(f"{name} is not as a recorder writes it")
+            raise HeaderError(f"{name} is invalid")
     has_escs = 1 <= len(header["escs"]) <= _MAX_ESCS
     if not has_escs or not isinstance(header["configuration"], str):
-        raise HeaderError("escs or configuration is not as a recorder writes it")
+        raise HeaderError("escs or configuration is invalid")
     check_state(header.get("state", {}))

@@ -162,9 +162,9 @@ def read_json(payload: bytes) -> dict[str, Any]:
     except RecursionError:
         raise ValueError("is nested too deep") from None
     except ValueError:  # Python's own text is not for users
-        raise ValueError("is no JSON text in UTF-8") from None
+        raise ValueError("is not JSON in UTF-8") from None
     if not isinstance(content, dict):
-        raise ValueError("is no JSON object")
+        raise ValueError("is not a JSON object")
     return content
 
 
@@ -195,7 +195,7 @@ def read_entries(payload: bytes, version: int = VERSION) -> Iterator[Entry]:
         yield _entry(head, payload[at : at + head[-1]], version)
         at += head[-1]
     if at != len(payload):
-        raise ValueError("is not as long as its table says")
+        raise ValueError("does not have the length that its table gives")
 
 
 def entry_at(payload: bytes, number: int, begin: int) -> Entry:
@@ -231,7 +231,7 @@ def frame_data(frame: CanFrame) -> bytes:
 def read_frame(data: bytes) -> CanFrame:
     """Return the CAN frame of an entry. Raises ValueError if the data are too short."""
     if len(data) < _FRAME.size:
-        raise ValueError("is no CAN frame")
+        raise ValueError("is not a CAN frame")
     key, flags = _FRAME.unpack_from(data)
     extended = bool(key & EXTENDED)
     return CanFrame(
@@ -265,7 +265,7 @@ def read_numbers(data: bytes) -> tuple[int, ...]:
     """Return the numbers of an entry. Raises ValueError if the length does not fit."""
     count, rest = divmod(len(data), _NUMBER.size)
     if rest:
-        raise ValueError("are no numbers")
+        raise ValueError("is not a list of numbers")
     return struct.unpack(f"<{count}Q", data)
 
 

@@ -20,7 +20,7 @@ def check_time(time_ns: int) -> None:
 def check_counters(counters: Sequence[int]) -> None:
     """Raise ValueError for numbers that are impossible in a COUNTERS entry."""
     if len(counters) != len(COUNTERS):
-        raise ValueError("has other counters")
+        raise ValueError("has an unexpected number of counters")
     check_time(counters[-1])
     if max(counters[:-1]) >= MAX_COUNT:
         raise ValueError(f"counter {max(counters[:-1])}")

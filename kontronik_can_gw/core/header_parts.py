@@ -38,7 +38,7 @@ def reading(part: str) -> Iterator[None]:
     except KeyError as error:
         raise HeaderError(f"{part}: {str(error.args[0])[:40]!r} is missing") from None
     except _UNUSABLE:
-        raise HeaderError(f"{part} is not as a recorder writes it") from None
+        raise HeaderError(f"{part} is invalid") from None
 
 
 def whole_number(value: Any, low: int, high: int) -> int:
@@ -65,7 +65,7 @@ def file_bytes(text: str, part: str) -> bytes:
         character = text[error.start]
         raise HeaderError(
             f"{part}: the text of the file has {character!r}, "
-            "but each character stands for one byte"
+            "but each character must fit in one byte"
         ) from None
 
 

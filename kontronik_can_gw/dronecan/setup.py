@@ -91,7 +91,7 @@ class DronecanSetup(OutputSetup):
         While a node-ID is unknown, these are all ids.
         """
         if not self.given.table.node_id:
-            return {id_block(0, 0): "DroneCAN, whose node-ID an allocator chooses"}
+            return {id_block(0, 0): "DroneCAN, because an allocator may assign any node-ID"}
         found = {}
         for node in self.nodes:
             user = f"DroneCAN node {node.node_id} (bits 0 to 6 of its ids)"
@@ -112,8 +112,8 @@ class DronecanSetup(OutputSetup):
         found = []
         if bitrate != _USUAL_BITRATE:
             found.append(
-                f"dronecan: can.bitrate is {bitrate // 1000} kbit/s; "
-                "autopilots run DroneCAN at 1000 kbit/s"
+                f"dronecan: can.bitrate is {bitrate // 1000} kbit/s, "
+                "but autopilots run DroneCAN at 1000 kbit/s"
             )
         table = self.given.table
         if table.rate_hz < _LOWEST_RATE_HZ:
@@ -124,20 +124,21 @@ class DronecanSetup(OutputSetup):
             )
         if table.extended_hz:
             found.append(
-                "dronecan.extended_hz: the motor temperature in esc.StatusExtended is not known "
-                "and sent as -256 degC, which PX4 takes for the temperature. "
+                "dronecan.extended_hz: the unknown motor temperature in esc.StatusExtended "
+                "is sent as -256 degC, which PX4 takes for a measurement. "
                 "Set extended_hz = 0 for PX4"
             )
         if not self.given.identity:
             found.append(
-                "dronecan: this machine has no id, so unique ids come from the names alone: "
-                "give each gateway on a bus its own dronecan.name"
+                "dronecan: this machine has no id, so unique ids are derived from names only. "
+                "Give each gateway on a bus its own dronecan.name"
             )
         plain = [esc.name for esc in self.escs if esc.pole_pairs == 1]
         if plain and table.rpm != "electrical":
             found.append(
-                f"dronecan: rpm of {', '.join(plain)} is sent as with one pole pair: "
-                'set pole_pairs in [[esc]], or dronecan.rpm = "electrical" if it is one'
+                f"dronecan: the rpm of {', '.join(plain)} is computed for one pole pair. "
+                "Set pole_pairs in [[esc]]. If the motor has one pole pair, "
+                'set dronecan.rpm = "electrical"'
             )
         return [f"{file}: {text}" for text in found]
 
@@ -145,7 +146,7 @@ class DronecanSetup(OutputSetup):
         first = self.given.table.first_index
         found = []
         for node in self.nodes:
-            node_id = f"node {node.node_id}" if node.node_id else "node-ID by an allocator"
+            node_id = _node_id_text(node)
             indices = str(first + node.escs[0])
             if len(node.escs) > 1:
                 indices += f" to {first + node.escs[-1]}"
@@ -160,9 +161,8 @@ class DronecanSetup(OutputSetup):
             for number in node.escs:
                 index = table.first_index + number
                 escs.append(f"{self.escs[number].name} is esc_index {index}")
-            node_id = node.node_id or "asks an allocator"
-            unique_id = node.unique_id.hex()
-            found.append(f"node {node_id}, {node.name}, unique id {unique_id}: {', '.join(escs)}")
+            named = f"{_node_id_text(node)}, {node.name}, unique id {node.unique_id.hex()}"
+            found.append(f"{named}: {', '.join(escs)}")
         sign = "negative while the motor turns backward" if table.negative_rpm else "never negative"
         speed = SPEEDS[table.rpm]
         sent = f"esc.Status at {table.rate_hz} Hz while telemetry is fresh"
@@ -171,9 +171,13 @@ class DronecanSetup(OutputSetup):
         return [
             *found,
             f"{sent}; NodeStatus, CircuitStatus and Temperature of the BEC each second",
-            f"rpm is {speed}, at most {MAX_RPM}: what is more is sent as that; {sign}",
+            f"rpm is {speed}, limited to {MAX_RPM}, {sign}",
             _RESOLUTION,
         ]
+
+
+def _node_id_text(node: NodeSetup) -> str:
+    return f"node {node.node_id}" if node.node_id else "node-ID from an allocator"
 
 
 def configured(config: Config, machine: Machine) -> DronecanSetup:
@@ -205,14 +209,14 @@ def _checked(given: Given, escs: Sequence[EscSettings]) -> DronecanSetup:
     if last_id > MAX_NODE_ID:
         highest = MAX_NODE_ID + 1 - len(setup.nodes)
         problems.append(
-            f"dronecan.node_id: that of the last node would be {last_id}. "
-            f"Choose one up to {highest}."
+            f"dronecan.node_id: the last node would have node-ID {last_id}. "
+            f"Choose at most {highest}."
         )
     last_index = given.table.first_index + len(escs) - 1
     if last_index > MAX_ESC_INDEX:
         problems.append(
-            f"dronecan.first_index: esc_index of the last ESC would be {last_index}. "
-            f"There are 0 to {MAX_ESC_INDEX}."
+            f"dronecan.first_index: the last ESC would have esc_index {last_index}. "
+            f"The highest esc_index is {MAX_ESC_INDEX}."
         )
     if problems:
         raise UserError(*problems)

@@ -54,7 +54,7 @@ def load(path: Path) -> Any:
     sizes.append(library.kcg_turns_size())
     expected = [c.sizeof(structure(name)) for name in _SIZED]
     if library.kcg_sizes(0) != source_number() or sizes != expected:
-        raise WrongObject(f"{path.name}: made of other sources than these")
+        raise WrongObject(f"{path.name}: built from other sources than this version")
     return library
 
 

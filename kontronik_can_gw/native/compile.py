@@ -61,8 +61,8 @@ def compile_core(
     """
     program = program or compiler()
     if program is None:
-        return "there was no C compiler at the installation"
-    named = f"at the installation {program} failed"
+        return "no C compiler was found during installation"
+    named = f"{program} failed during installation"
     part = target.with_name(f"{target.name}.part")
     try:
         done = _run(program, options, part)

@@ -42,7 +42,7 @@ class _Row(c.Structure):
     def __setattr__(self, name: str, value: Any) -> None:
         super().__setattr__(name, value)
         if isinstance(value, int) and getattr(self, name) != value:
-            raise NotInCore(f"{name} {value} does not fit")
+            raise NotInCore(f"{name} {value} is too large")
 
 
 _ROWS = {"kcg_piece", "kcg_pair", "kcg_signal", "kcg_message", "kcg_settings", "kcg_slot_row"}

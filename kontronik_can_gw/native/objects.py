@@ -60,7 +60,7 @@ def fault(path: Path) -> str:
     try:
         content = path.read_bytes()
         if zlib.crc32(content) != _SEALED:
-            return f"{path.name}: cut off or damaged"
+            return f"{path.name}: truncated or damaged"
     except FileNotFoundError:
         return _not_built() or f"no {path.name} in this installation"
     except OSError as error:
@@ -69,7 +69,7 @@ def fault(path: Path) -> str:
         with Path("/proc/self/exe").open("rb") as program:
             mine = _machine(program.read(20))
     except OSError as error:
-        return f"which machine this is cannot be read: {error}"
+        return f"the type of this machine cannot be read: {error}"
     return "" if _machine(content) == mine else f"{path.name}: built for another machine"
 
 

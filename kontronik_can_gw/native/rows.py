@@ -69,7 +69,7 @@ def bind_direction(
     """
     word, states = negative_in
     if row.kind != KCG.OF_LIVE or max(states) >= _MASK_BITS or row.mask:
-        raise NotInCore("a sign by a state of this number")
+        raise NotInCore(f"a sign that depends on states up to {max(states)}")
     row.kind = KCG.OF_DIRECTED
     row.state_place = places[word][0]
     row.negative_states = sum(1 << state for state in states)
@@ -82,9 +82,11 @@ def settings_of(esc: EscSettings) -> Any:
     """
     numerator, denominator = esc.gear.numerator, esc.gear.denominator
     if max(numerator, denominator) > MAX_GEAR:
-        raise NotInCore(f"{esc.name}: gear {esc.gear}: parts above {MAX_GEAR}")
+        raise NotInCore(f"{esc.name}: gear {esc.gear} has a number above {MAX_GEAR}")
     if esc.pole_pairs > MAX_POLES or esc.cell_count > MAX_CELLS:
-        raise NotInCore(f"{esc.name}: {esc.pole_pairs} pole pairs, {esc.cell_count} cells")
+        raise NotInCore(
+            f"{esc.name}: too many pole pairs ({esc.pole_pairs}) or cells ({esc.cell_count})"
+        )
     return Settings(
         timeout=esc.timeout_ns,
         crc_errors=min(esc.crc_error_threshold, 0xFFFF_FFFF),

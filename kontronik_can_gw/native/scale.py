@@ -107,7 +107,7 @@ def _set_integer_scale(row: Any, signal: SignalPlan, value: Value) -> None:
     by, over = _LARGEST_DIVISOR[value.divisor]
     greatest = most * abs(mul) * over + abs(add) * by
     if greatest >= _LIMIT or div * by >= _LIMIT:
-        raise NotInCore(f"factor {_decimal(signal.factor)} leaves 64 bits")
+        raise NotInCore(f"factor {_decimal(signal.factor)} exceeds 64 bits")
     row.mul = mul
     row.add = add
     row.div = div
@@ -142,7 +142,7 @@ def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
     most = max(map(abs, _range(row, value)))
     greatest = most * abs(mul) * over
     if signal.numbers is None and max(greatest, div * by) >= _LIMIT // 2:
-        raise NotInCore(f"factor {_decimal(signal.factor)} leaves 63 bits")
+        raise NotInCore(f"factor {_decimal(signal.factor)} exceeds 63 bits")
     if signal.numbers is None:
         row.mul, row.div = mul, div
     row.add = _bits_of(float(signal.intercept))

@@ -95,7 +95,7 @@ def slot_rows(plan: SlotPlan, protocol: str) -> Tables:
     tables = Tables(layout, (settings,))
     rows = max(len(tables.signals), len(tables.pieces))
     if rows > MAX_SIGNALS or tables.pairs:
-        raise NotInCore(f"{len(tables.signals)} values")
+        raise NotInCore(f"too many values in one frame ({len(tables.signals)})")
     return tables
 
 

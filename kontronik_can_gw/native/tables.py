@@ -73,20 +73,21 @@ class Tables:
         self._wire = [places_of(protocol_named(esc.protocol)) for esc in escs]
         starts = phases([plan.cycle_ns for plan in layout.messages])
         if len(escs) >= ALL_ESCS or len(layout.messages) > 0xFFFF:
-            raise NotInCore(f"{len(escs)} ESCs, {len(layout.messages)} messages")
+            raise NotInCore(f"too many ESCs ({len(escs)}) or messages ({len(layout.messages)})")
         for index, plan in enumerate(layout.messages):
             if plan.length > KCG.DATA or len(plan.pages) > KCG.PAGES:
-                raise NotInCore(f"{plan.name}: {plan.length} bytes, {len(plan.pages)} pages")
+                size = f"{plan.length} bytes, {len(plan.pages)} pages"
+                raise NotInCore(f"{plan.name}: too large ({size})")
             longest = max(plan.cycle_ns, plan.delay_ns)
             if longest >= END_OF_TIME:
-                raise NotInCore(f"{plan.name}: a cycle or distance of {longest} ns")
+                raise NotInCore(f"{plan.name}: a cycle time or delay of {longest} ns is too long")
             self._add(plan, silent_on_loss, starts[index])
             for esc in plan.escs:
                 if self.messages[-1].triggers:
                     self.listeners_of[esc].append(index)
         most = max(len(self.signals), self.pages, len(self.listeners))
         if most > MAX_ROWS:
-            raise NotInCore(f"{len(self.signals)} signals, {self.pages} pages")
+            raise NotInCore(f"too many signals ({len(self.signals)}) or pages ({self.pages})")
 
     @property
     def names(self) -> dict[str, list[str]]:
@@ -180,7 +181,7 @@ class Tables:
 
     def _add_signal(self, signal: SignalPlan, plan: MessagePlan, has_crc: bool) -> None:
         if signal.length > MAX_BITS:
-            raise NotInCore(f"{plan.name}.{signal.name}: {signal.length} bits")
+            raise NotInCore(f"{plan.name}.{signal.name}: too long ({signal.length} bits)")
         first_piece = len(self.pieces)
         for piece in signal.pieces:  # split at borders of 64 bits
             width = min(piece.width, 64 - piece.at % 64)
@@ -204,9 +205,8 @@ class Tables:
             row.kind = KCG.OF_ALIVE
             row.div = alive_modulus(signal, has_crc)
             if row.div > MAX_ALIVE:
-                raise NotInCore(
-                    f"{plan.name}.{signal.name}: an alive counter of {signal.length} bits"
-                )
+                name = f"{plan.name}.{signal.name}"
+                raise NotInCore(f"{name}: an alive counter of {signal.length} bits is too long")
         else:
             assert signal.source is not None
             places = self._wire[signal.esc or 0]
@@ -279,13 +279,13 @@ def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
         row.kind = KCG.OF_COUNT
         row.place = COUNTS.index(name)
     else:
-        raise NotInCore(f"no source {value.name}")
+        raise NotInCore(f"{value.name} is computed in Python only")
 
 
 def places_of(protocol: EscProtocol) -> Places:
     """Return offset and type of each word. Raises NotInCore if C cannot decode the protocol."""
     if protocol.wire is None:
-        raise NotInCore(f"ESC protocol {protocol.name}")
+        raise NotInCore(f"ESC protocol {protocol.name} is decoded in Python only")
     found: Places = ([], [])
     for places, (codes, _) in zip(found, protocol.wire, strict=True):
         at = 0

@@ -126,7 +126,7 @@ def test_two_names_of_one_device_are_refused(tmp_path: Path, terminal: PtyEsc) -
     for command in ("check", "run"):
         assert (
             refused(2, command, "-c", file)
-            == f"{file}: the ports of esc1 and esc2 are one device, {device}"
+            == f"{file}: the ports of esc1 and esc2 are the same device, {device}"
         )
 
 
@@ -247,7 +247,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     (tmp_path / "x.bin").write_bytes(b"KODL")
     file = configuration(tmp_path, port)
     adapter = ["--interface", "slcan", "--channel", f"{port}@115200"]
-    assert "nothing may be sent to an ESC" in refused(2, *words.split(), "-c", file, *adapter)
+    assert "Nothing may be sent to an ESC" in refused(2, *words.split(), "-c", file, *adapter)
     assert port.read_bytes() == b""
 
 

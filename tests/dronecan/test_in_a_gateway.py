@@ -65,7 +65,7 @@ def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
     (node,) = [line for line in lines if line.startswith("node 42, kontronik_can_gw, unique id")]
     assert node.endswith("left is esc_index 4, right is esc_index 5")
     assert "float16: voltage in steps of 0.016 V from 16 V on, 0.031 V from 32 V" in "".join(lines)
-    assert "rpm is motor_speed, at most 131071" in "".join(lines)
+    assert "rpm is motor_speed, limited to 131071" in "".join(lines)
     # 2 x (50 x (8, 8, 3 bytes) + 10 x 8 bytes + 8 + 6 bytes) + 8 bytes, 29 bits, worst stuffing
     bits = 2 * (50 * (160 + 160 + 110) + 10 * 160 + 160 + 140) + 160
     assert found["bus_load"] == pytest.approx(bits / 1e6)
@@ -75,10 +75,10 @@ def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "given", "code", "said"),
     [
-        ("", {"kbit": 500}, 0, "can.bitrate is 500 kbit/s; autopilots run DroneCAN at 1000 kbit/s"),
+        ("", {"kbit": 500}, 0, "can.bitrate is 500 kbit/s, but autopilots run DroneCAN at"),
         ("rate_hz = 100", {"kbit": 125}, 0, "the DroneCAN nodes need 69% of 125 kbit/s"),
         ("rate_hz = 200", {"kbit": 125}, 2, "the DroneCAN nodes need"),
-        ("", {"poles": 1}, 0, "rpm of right is sent as with one pole pair: set pole_pairs in"),
+        ("", {"poles": 1}, 0, "rpm of right is computed for one pole pair. Set pole_pairs in"),
         ("rpm = 'electrical'", {"poles": 1}, 0, ""),
         (
             "rate_hz = 9",
@@ -86,9 +86,9 @@ def test_check_shows_nodes_resolution_and_load(tmp_path: Path) -> None:
             0,
             "dronecan.rate_hz is 9: below 10 ArduPilot may take a running motor",
         ),
-        ("extended_hz = 1", {}, 0, "sent as -256 degC, which PX4 takes for the temperature"),
+        ("extended_hz = 1", {}, 0, "sent as -256 degC, which PX4 takes for a measurement"),
         ("rate_hz = 10", {"poles": 7}, 0, ""),
-        ("", {}, 0, "give each gateway on a bus its own dronecan.name"),
+        ("", {}, 0, "Give each gateway on a bus its own dronecan.name"),
     ],
 )
 def test_check_warns_of_unusual_settings(
@@ -113,8 +113,8 @@ def test_check_warns_of_unusual_settings(
 @pytest.mark.parametrize(
     ("table", "reason"),
     [
-        ({"node_id": 125, "per_esc_nodes": True}, "node_id: that of the last node would be 126."),
-        ({"first_index": 31}, "first_index: esc_index of the last ESC would be 32."),
+        ({"node_id": 125, "per_esc_nodes": True}, "node_id: the last node would have node-ID 126."),
+        ({"first_index": 31}, "first_index: the last ESC would have esc_index 32."),
         ({"name": "Left"}, "name: 'Left' is not a name of 1 to 60 lower-case letters"),
     ],
 )
@@ -129,7 +129,7 @@ def test_a_mistake_is_refused_in_one_line(table: dict[str, Any], reason: str) ->
     ("can_id", "more", "user"),
     [
         (0x2B, "node_id = 42\nper_esc_nodes = true", "DroneCAN node 43"),
-        (0x10345210, "node_id = 0", "DroneCAN, whose node-ID an allocator chooses"),
+        (0x10345210, "node_id = 0", "DroneCAN, because an allocator may assign any node-ID"),
         (0x1034522B, "node_id = 42", ""),
         (0x2B - (1 << 31), "node_id = 42\nper_esc_nodes = true", ""),  # 11 bits: another frame
     ],

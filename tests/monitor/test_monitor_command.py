@@ -80,7 +80,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     toml = written(tmp_path / "g.toml", text)
     done = run(*command, "-c", toml, "--interface", "slcan", "--channel", f"{port}@115200")
     assert done.code == 2
-    assert "nothing may be sent to an ESC" in done.err
+    assert "Nothing may be sent to an ESC" in done.err
 
 
 @pytest.fixture(scope="module")

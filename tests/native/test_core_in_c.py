@@ -117,7 +117,7 @@ def test_a_factor_that_does_not_fit_is_refused_with_one_that_fits(
     escs = [EscSettings("esc1")]
     with pytest.raises(NotInCore) as found:
         Tables(compiled(text.format(factor), bind={"S": "output_speed"}), escs)
-    advice = re.search(r"leaves 6[34] bits\. Factor (\S+) fits", str(found.value))
+    advice = re.search(r"exceeds 6[34] bits\. Factor (\S+) fits", str(found.value))
     assert advice is not None, str(found.value)
     Tables(compiled(text.format(advice[1]), bind={"S": "output_speed"}), escs)
 
@@ -130,7 +130,7 @@ def test_a_factor_that_leaves_64_bits_is_named_with_one_that_fits() -> None:
     with pytest.raises(NotInCore) as found:
         Tables(refused, escs)
     message = str(found.value)
-    pattern = r"M\.S: factor 0.0039215686 leaves 64 bits\. Factor (\S+) fits"
+    pattern = r"M\.S: factor 0.0039215686 exceeds 64 bits\. Factor (\S+) fits"
     advice = re.fullmatch(pattern, message)
     assert advice is not None, message
     Tables(compiled(text.format(advice[1]), bind={"S": "output_speed"}), escs)
@@ -211,5 +211,5 @@ def test_the_core_stays_in_its_memory_and_has_no_undefined_behaviour(tmp_path: P
 
 def test_an_object_of_other_sources_is_refused_in_one_line(tmp_path: Path) -> None:
     options = [option.replace("KCG_DATA=64", "KCG_DATA=8") for option in OPTIONS]
-    with pytest.raises(WrongObject, match="made of other sources"):
+    with pytest.raises(WrongObject, match="built from other sources"):
         load(built(tmp_path / "small.so", *options))

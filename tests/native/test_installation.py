@@ -66,10 +66,10 @@ def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str,
     ("compiles", "why"),
     [
         (None, ""),
-        ("", "there was no C compiler at the installation"),
+        ("", "no C compiler was found during installation"),
         (
             "echo 'cc: error: broken' >&2\nexit 1\n",
-            "at the installation {} failed: cc: error: broken",
+            "{} failed during installation: cc: error: broken",
         ),
     ],
     ids=["with a compiler", "without one", "with one that fails"],

@@ -90,7 +90,7 @@ def test_the_c_core_runs_unless_the_python_core_is_requested(
     assert why() == said
 
 
-DAMAGED = "core-other.so: cut off or damaged"
+DAMAGED = "core-other.so: truncated or damaged"
 OTHER_MACHINE = "core-other.so: built for another machine"
 
 
@@ -99,7 +99,7 @@ OTHER_MACHINE = "core-other.so: built for another machine"
     ("made_of", "said"),
     [
         (lambda _: None, "no core-other.so in this installation"),
-        (lambda _: None, "there was no C compiler at the installation"),
+        (lambda _: None, "no C compiler was found during installation"),
         (lambda whole: whole[:-1], DAMAGED),
         (lambda whole: whole[:4096] + bytes(4096) + whole[8192:], DAMAGED),
         (lambda whole: sealed(whole[:18] + b"\xfe\xca" + whole[20:-4]), OTHER_MACHINE),
@@ -120,7 +120,7 @@ def test_the_python_core_runs_if_the_c_core_cannot_be_loaded(
         path.write_bytes(content)
     monkeypatch.setattr(load, "shared_object", lambda: path)
     monkeypatch.setattr(objects, "NOT_BUILT", not_built)
-    if said.startswith("there was"):
+    if said.startswith("no C compiler"):
         not_built.write_text(f"{said}\n")
     found = why()
     assert load.in_words("Python", found) == f"core: Python ({found})"
@@ -188,9 +188,9 @@ def test_settings_that_the_c_core_cannot_express_run_in_python(
 ) -> None:
     other = replace(protocols.PROTOCOLS[0], name="other", wire=None)
     monkeypatch.setattr(protocols, "PROTOCOLS", (*protocols.PROTOCOLS, other))
-    assert why(protocol="other") == "ESC protocol other"
+    assert why(protocol="other") == "ESC protocol other is decoded in Python only"
     assert why(gear=Fraction(MAX_GEAR)) == ""
-    assert f"parts above {MAX_GEAR}" in why(gear=Fraction(MAX_GEAR + 1))
+    assert f"has a number above {MAX_GEAR}" in why(gear=Fraction(MAX_GEAR + 1))
 
 
 @needs_c
@@ -208,7 +208,7 @@ def test_an_object_of_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -
     """The number that an object carries covers the generated header, not only the C files."""
     header = objects.wire_header()
     monkeypatch.setattr(objects, "wire_header", lambda: header.replace("live, 4", "live, 5"))
-    assert why() == f"{objects.shared_object().name}: made of other sources than these"
+    assert why() == f"{objects.shared_object().name}: built from other sources than this version"
 
 
 @needs_c
@@ -216,13 +216,13 @@ def test_an_object_of_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -
     ("signal", "more", "said"),
     [
         (VOLTAGE.format(16, "0.01"), "", ""),
-        (VOLTAGE.format(16, "1e70"), "", "leaves 64 bits. Factor"),
-        (VOLTAGE.format(16, "18446744073709551616"), "", "leaves 64 bits. Factor"),
+        (VOLTAGE.format(16, "1e70"), "", "exceeds 64 bits. Factor"),
+        (VOLTAGE.format(16, "18446744073709551616"), "", "exceeds 64 bits. Factor"),
         (VOLTAGE.format(16, "1e-70"), "", "M.BatteryVoltage: "),
-        (LINK_STATE, "", "leaves 64 bits. Factor"),
-        (VOLTAGE.format(16, "0.01"), CYCLE.format(10_000_000_000_000), "a cycle or distance"),
+        (LINK_STATE, "", "exceeds 64 bits. Factor"),
+        (VOLTAGE.format(16, "0.01"), CYCLE.format(10_000_000_000_000), "a cycle time or delay"),
         (VOLTAGE.format(64, "0.01"), "", ""),
-        (VOLTAGE.format(65, "0.01"), "", "M.BatteryVoltage: 65 bits"),
+        (VOLTAGE.format(65, "0.01"), "", "M.BatteryVoltage: too long (65 bits)"),
     ],
 )
 def test_numbers_that_leave_64_bits_run_in_python(signal: str, more: str, said: str) -> None:
@@ -239,9 +239,9 @@ def test_a_failing_compiler_is_reported_in_one_line(
     target = tmp_path / "core.so"
     program.write_text("#!/bin/sh\nprintf 'In file:\\nfatal error: \\377' >&2\nexit 1\n")
     program.chmod(0o755)
-    said = f"at the installation {program} failed: fatal error: \ufffd"
+    said = f"{program} failed during installation: fatal error: \ufffd"
     assert compile_core(target, program=str(program)) == said
     assert "No such file" in str(compile_core(target, program=f"{program}2"))
     monkeypatch.setattr(compiling, "compiler", lambda: None)
-    assert compile_core(target) == "there was no C compiler at the installation"
+    assert compile_core(target) == "no C compiler was found during installation"
     assert not target.exists()
