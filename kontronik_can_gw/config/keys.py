@@ -63,12 +63,14 @@ class CanConfig:
         "interface of python-can: socketcan, virtual, pcan, kvaser, slcan ...")
     channel: str = key(TEXT, "can0", "channel of that interface, for example can0")
     bitrate: int = key(integer(10_000, 1_000_000), 500_000,
-        "bit rate in bit/s. With socketcan the system sets it, and the gateway only computes the bus load from it")
+        "bit rate in bit/s. "
+        "With socketcan the system sets it, and the gateway only computes the bus load from it")
     fd: bool = key(BOOLEAN, False, "allow CAN FD, that is messages of more than 8 bytes")
     data_bitrate: int = key(integer(10_000, 8_000_000), 2_000_000,
         "bit rate of CAN FD's data phase in bit/s")
     options: Mapping[str, str | float] = key(options("can", _OF_CAN), {},
-        "more options of the python-can interface, for example host or ttyBaudrate. SocketCAN has none")
+        "more options of the python-can interface, for example host or ttyBaudrate. "
+        "SocketCAN has none")
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,15 @@ class RecordConfig:
     """Captures: recordings of all input, to replay and convert later."""
 
     directory: str | None = key(TEXT, None,
-        "folder for captures, relative to the configuration's folder. 'state' is the folder captures "
-        "in the service's state folder (default: only `run --record` records)")
+        "folder for captures, relative to the configuration's folder. "
+        "'state' is the folder captures in the service's state folder "
+        "(default: only `run --record` records)")
     part_mb: int = key(integer(1, 4000), 64, "begin a new file at this size in megabytes")
     part_minutes: int = key(integer(1, 10_000), 60,
         "begin a new file after this time in minutes")
     keep_mb: int = key(integer(0, 10_000_000), 0,
-        "remove the oldest captures while the folder's captures exceed this number of megabytes. 0 removes none")
+        "remove the oldest captures while the folder's captures exceed this number of megabytes. "
+        "0 removes none")
     min_free_mb: int = key(integer(0, 10_000_000), 100,
         "pause recording while the file system has less free space, in megabytes")
 
@@ -112,13 +116,16 @@ class MqttConfig:
     """Broker, topics and rate of `kontronik-can-gw mqtt`."""
 
     broker: str | None = key(BROKER, None,
-        "MQTT broker, for example broker.example or 192.168.1.5:1883 (default port: 1883, with TLS 8883)")
-    tls: bool = key(BOOLEAN, False, "encrypt the connection, and check the broker's certificate and name")
+        "MQTT broker, for example broker.example or 192.168.1.5:1883 "
+        "(default port: 1883, with TLS 8883)")
+    tls: bool = key(BOOLEAN, False,
+        "encrypt the connection, and check the broker's certificate and name")
     ca_file: str | None = key(TEXT, None,
         "certificate of the authority that signed the broker's certificate, relative to the "
         "configuration's folder (default: the system's authorities)")
     cert_file: str | None = key(TEXT, None,
-        "client certificate, relative to the configuration's folder, for a broker that requires one")
+        "client certificate, relative to the configuration's folder, "
+        "for a broker that requires one")
     key_file: str | None = key(TEXT, None,
         "key of the client certificate, relative to the configuration's folder")
     username: str | None = key(TEXT, None, "user name at the broker")
@@ -130,7 +137,8 @@ class MqttConfig:
     rate: float = key(number(0.01, 20), 1.0, "state messages per second for each ESC")
     retain: bool = key(BOOLEAN, False, "ask the broker to keep the last state message of each ESC")
     discovery: str | None = key(TOPIC, None,
-        "topic prefix of Home Assistant's discovery, usually 'homeassistant' (default: no discovery)")
+        "topic prefix of Home Assistant's discovery, usually 'homeassistant' "
+        "(default: no discovery)")
 
     @property
     def address(self) -> tuple[str, int] | None:
@@ -150,17 +158,20 @@ class EscConfig:
 
     port: str = key(TEXT, REQUIRED, "serial port, preferably a name below /dev/serial/by-id")
     name: str = key(ESC_NAME, "",
-        "short name, which becomes a prefix of messages and signals if there are several ESCs. The shipped DBC "
-        "has room for 6 letters (default: esc1, esc2 ...)")
+        "short name, which becomes a prefix of messages and signals if there are several ESCs. "
+        "The shipped DBC has room for 6 letters (default: esc1, esc2 ...)")
     pole_pairs: int = key(integer(1, 100), 1,
         "pole pairs of the motor (half the number of magnets)")
     gear: Fraction = key(RATIO, Fraction(1),
-        "motor revolutions per revolution of the gear's output: a number or 'numerator/denominator'")
-    cell_count: int = key(integer(0, 255), 0, "cells of the battery. 0: the number that the ESC reports")
+        "motor revolutions per revolution of the gear's output: "
+        "a number or 'numerator/denominator'")
+    cell_count: int = key(integer(0, 255), 0,
+        "cells of the battery. 0: the number that the ESC reports")
     telemetry_timeout_ms: int = key(integer(20, 60_000), 250,
         "age in milliseconds above which live values are not available")
     node_id: int | None = key(NODE_ID, None,
-        "CANopen node-ID of this ESC. 255: the node waits for LSS (default: counted up from canopen.node_id)")
+        "CANopen node-ID of this ESC. "
+        "255: the node waits for LSS (default: counted up from canopen.node_id)")
     device: str | None = key(choice_of(device_names), None,
         "expected device. Any other device on this port is reported (CANopen EMCY 7510h)")
     protocol: str = key(choice_of(protocol_names), PROTOCOLS[0].name,

@@ -59,9 +59,11 @@ class DbcConfig:
     e2e_data_ids: Mapping[str, int] = key(table_of(integer(0, 0xFFFF)), {},
         "name of a message = its AUTOSAR E2E data id (default: the CAN id)")
     units: Mapping[str, str] = key(meanings(units.names()), {},
-        "unit text in the DBC = the unit that is meant, for texts that the gateway does not recognise")
+        "unit text in the DBC = the unit that is meant, "
+        "for texts that the gateway does not recognise")
     send_type: Mapping[str, str] = key(meanings(tuple(SEND_TYPES)), {},
-        "GenMsgSendType in the DBC = the send type that is meant, for names that the gateway does not recognise")
+        "GenMsgSendType in the DBC = the send type that is meant, "
+        "for names that the gateway does not recognise")
 
     @property
     def silent_on_loss(self) -> bool:
@@ -84,13 +86,17 @@ class CanopenConfig:
         "serial number of the first node in 1018h:4. The others count up from it "
         "(default: derived from the machine's id)")
     self_start: bool = key(BOOLEAN, False,
-        "true: nodes become OPERATIONAL after boot-up without a master (1F80h). false: as the EDS defines it")
+        "true: nodes become OPERATIONAL after boot-up without a master (1F80h). "
+        "false: as the EDS defines it")
     read_only: bool = key(BOOLEAN, False, "refuse all writes over the bus, and LSS")
     cia402_mirrors: bool = key(BOOLEAN, True,
-        "offer the objects from 6000h to 67FFh (speed, DC link voltage, error code), for generic drive tools")
+        "offer the objects from 6000h to 67FFh (speed, DC link voltage, error code), "
+        "for generic drive tools")
     store: str | None = key(TEXT, None,
-        "folder for parameters that masters store (default: the service's state folder; without a service "
-        "/var/lib/kontronik-can-gw for root, ~/.local/state/kontronik-can-gw for other users)")
+        "folder for parameters that masters store "
+        "(default: the service's state folder; "
+        "without a service /var/lib/kontronik-can-gw for root, "
+        "~/.local/state/kontronik-can-gw for other users)")
 
 
 @dataclass(frozen=True)
@@ -101,24 +107,29 @@ class DronecanConfig:
     node_id: int = key(integer(0, 125), 0,
         "node-ID of the first node. The others count up from it. 0: an allocator on the bus, "
         "for example ArduPilot or PX4, assigns all node-IDs")
-    per_esc_nodes: bool = key(BOOLEAN, False, "run a node for each ESC instead of one for the gateway")
+    per_esc_nodes: bool = key(BOOLEAN, False,
+        "run a node for each ESC instead of one for the gateway")
     name: str = key(NODE_NAME, "kontronik_can_gw",
         "name of the node. With per_esc_nodes each name is NAME.ESC, ESC being the ESC's name")
     first_index: int = key(integer(0, 31), 0,
-        "esc_index of the first ESC. The others count up from it. PX4 and Betaflight use it unchanged, "
-        "ArduPilot adds CAN_Dn_UC_ESC_OF")
+        "esc_index of the first ESC. The others count up from it. "
+        "PX4 and Betaflight use it unchanged, ArduPilot adds CAN_Dn_UC_ESC_OF")
     rate_hz: int = key(integer(1, 200), 50,
-        "esc.Status messages per second for each ESC, while its telemetry is fresh. ArduPilot needs at least 10")
+        "esc.Status messages per second for each ESC, while its telemetry is fresh. "
+        "ArduPilot needs at least 10")
     extended_hz: int = key(integer(0, 200), 0,
         "esc.StatusExtended messages (throttle, duty, error bits) per second for each ESC. "
         "0 sends none, because this message cannot mark a value as unknown")
     rpm: str = key(choice("motor", "output", "electrical"), "motor",
-        "speed to send: 'motor' (for ArduPilot and PX4), 'output' of the gear, or 'electrical' (for Betaflight)")
+        "speed to send: 'motor' (for ArduPilot and PX4), 'output' of the gear, or 'electrical' "
+        "(for Betaflight)")
     negative_rpm: bool = key(BOOLEAN, True,
-        "send a negative rpm while the motor turns backward, as the DSDL requires. false: never negative")
+        "send a negative rpm while the motor turns backward, as the DSDL requires. "
+        "false: never negative")
     health: str = key(choice("gateway", "esc"), "gateway",
-        "source of the node's health: 'gateway' alone, or 'esc', which also counts errors of an ESC "
-        "and lost telemetry. While these last, ArduPilot does not arm")
+        "source of the node's health: 'gateway' alone, or 'esc', "
+        "which also counts errors of an ESC and lost telemetry. "
+        "While these last, ArduPilot does not arm")
     log_messages: bool = key(BOOLEAN, True,
         "send a LogMessage with the remedy when an error of an ESC begins or ends")
 # fmt: on

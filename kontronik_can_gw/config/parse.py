@@ -145,7 +145,8 @@ def _esc_problems(escs: Mapping[int, EscConfig]) -> Iterator[str]:
         yield f"esc[{number}].port: {escs[number].port!r} is already used by esc[{other}]"
     for number, esc in escs.items():
         if esc.device is not None and esc.device_number is None:
-            yield f"esc[{number}].device: {esc.device!r} is not a device of the protocol {esc.protocol}"
+            problem = f"{esc.device!r} is not a device of the protocol {esc.protocol}"
+            yield f"esc[{number}].device: {problem}"
     for number, esc in escs.items():
         if _is_ambiguous(names[number], {"", *names.values()}):
             yield (

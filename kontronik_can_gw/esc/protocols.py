@@ -20,9 +20,7 @@ def protocol_named(name: str | None) -> EscProtocol:
     for protocol in PROTOCOLS:
         if protocol.name == name:
             return protocol
-    raise ValueError(
-        f"ESC protocol {name[:40]!r} is unknown, there is {', '.join(protocol_names())}"
-    )
+    raise ValueError(f"unknown ESC protocol {name[:40]!r}. Known: {', '.join(protocol_names())}")
 
 
 def protocol_names() -> tuple[str, ...]:

@@ -266,12 +266,20 @@ def _reader_of(attribute: str) -> Read:
     return lambda esc, _gateway, _now: get(esc)
 
 
+def _energy_mw_s(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int:
+    return esc.energy_mw_ns // SECOND
+
+
+def _data_age_ms(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> int | None:
+    return esc.age_ms(now)
+
+
 _LINK: tuple[tuple[str, str, Kind, Read, int], ...] = (
-    ("energy_used", "Wh", Kind.INTEGRAL, lambda esc, _gw, _now: esc.energy_mw_ns // SECOND, MWS_PER_WH),
+    ("energy_used", "Wh", Kind.INTEGRAL, _energy_mw_s, MWS_PER_WH),
     ("motor_run_time", "s", Kind.RUN_TIME, _reader_of("run_time_ns"), SECOND),
     ("link_state", "", Kind.STATE, _reader_of("link"), 1),
     ("layout", "", Kind.STATE, _reader_of("layout"), 1),
-    ("data_age", "ms", Kind.AGE, lambda esc, _gw, now: esc.age_ms(now), 1),
+    ("data_age", "ms", Kind.AGE, _data_age_ms, 1),
     ("frame_rate", "Hz", Kind.RATE, _reader_of("frame_rate"), 10),
     ("losses", "", Kind.COUNT, _reader_of("losses"), 1),
     ("crc_errors", "", Kind.COUNT, _reader_of("counters.crc_errors"), 1),

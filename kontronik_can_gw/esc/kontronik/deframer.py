@@ -129,22 +129,36 @@ class Counters:
             return None
         received = self.bytes - old.bytes
         if not received:
-            return "no bytes: ESC off, wire open, wrong port, or a KOSMIK that waits for one throttle pulse after power-up"
+            return (
+                "no bytes: ESC off, wire open, wrong port, "
+                "or a KOSMIK that waits for one throttle pulse after power-up"
+            )
         if self.longer_crcs > old.longer_crcs:
             return (
-                "live frames of 38 bytes whose CRC covers 34 bytes instead of 32: no recording of such an ESC is known, so they are "
-                "not accepted. Please report device and firmware with a recording"
+                "live frames of 38 bytes whose CRC covers 34 bytes instead of 32: "
+                "no recording of such an ESC is known, so they are not accepted. "
+                "Please report device and firmware with a recording"
             )
         if self.crc_errors > old.crc_errors:
-            return "headers but no valid CRC: noise on the line, bytes lost, or another revision of the protocol"
+            return (
+                "headers but no valid CRC: "
+                "noise on the line, bytes lost, or another revision of the protocol"
+            )
         if self.headers > old.headers or self.pending >= 4:
             return "a header but no whole frame yet"
         if self.unknown_kinds > old.unknown_kinds:
             return "KOD frames of unknown kind: a newer protocol?"
         noise = self.dropped_noise - old.dropped_noise
-        if noise >= 64 and (self.long_run_bytes - old.long_run_bytes) * 10 >= noise * 9:
-            return "bytes but never KOD, in long runs of equal bits: a slower line, as the 9600 baud of an old JIVE (not PRO)"
-        return "bytes but never KOD: wrong parity (8E1 is needed), inverted signal, or the ESC is set to another protocol"
+        in_long_runs = self.long_run_bytes - old.long_run_bytes
+        if noise >= 64 and in_long_runs * 10 >= noise * 9:
+            return (
+                "bytes but never KOD, in long runs of equal bits: "
+                "a slower line, such as the 9600 baud of an old JIVE (not PRO)"
+            )
+        return (
+            "bytes but never KOD: wrong parity (8E1 is needed), inverted signal, "
+            "or the ESC is set to another protocol"
+        )
 
 
 _NAMES = tuple(f.name for f in fields(Counters))

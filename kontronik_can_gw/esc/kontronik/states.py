@@ -45,7 +45,9 @@ class OperatingState(IntEnum):
 
     about: State
 
-    def __new__(cls, number: int, meaning: str, kind: str, phase: str, remedy: str = "Nothing to do.") -> Self:
+    def __new__(
+        cls, number: int, meaning: str, kind: str, phase: str, remedy: str = "Nothing to do."
+    ) -> Self:
         member = int.__new__(cls, number)
         member._value_ = number
         member.about = State("", meaning, remedy, kind, phase)
@@ -55,7 +57,8 @@ class OperatingState(IntEnum):
         self.about = self.about._replace(text=self.name)
 
     WaitForSignal = (1, "waits for a signal at its input", "idle", "Waiting",
-        "If this state persists: switch on transmitter and receiver, and check the cable from the receiver.")
+        ("If this state persists: switch on transmitter and receiver, "
+         "and check the cable from the receiver."))
     WaitForMotorOff = (2, "waits for the command motor off", "idle", "Waiting",
         "If this state persists: move the throttle to motor off.")
     WaitForMotorOn = (3, "waits for the command motor on", "idle", "Waiting")
@@ -96,12 +99,15 @@ class OperatingError(ErrorBit):
     """Bits of the error word: live frame, offset 28."""
 
     UNDERVOLTAGE = (0, _E, "battery voltage too low",
-        "Stop soon. Charge or check the battery. Check connectors and cables: long or thin ones lose voltage under load.", 0x3220)
+        ("Stop soon. Charge or check the battery. "
+         "Check connectors and cables: long or thin ones lose voltage under load."), 0x3220)
     OVERVOLTAGE = (1, _E, "battery voltage too high",
-        "Check that the number of cells suits the ESC. If it occurs while braking: a full battery or a power supply takes no energy back.",
+        ("Check that the number of cells suits the ESC. "
+         "If it occurs while braking: a full battery or a power supply cannot take energy back."),
         0x3210)
     OVERCURRENT_INTEGRAL_ERROR = (2, _E, "current too high for too long: switched off",
-        "Stop. Check that motor and drive turn freely. Reduce the load: smaller propeller or pinion, less pitch, less throttle.",
+        ("Stop. Check that motor and drive turn freely. "
+         "Reduce the load: smaller propeller or pinion, less pitch, less throttle."),
         0x2350)
     OVERCURRENT_INTEGRAL_WARNING = (3, _W, "current high for a long time",
         "Reduce the load before the ESC switches off.", 0x2351)
@@ -110,11 +116,14 @@ class OperatingError(ErrorBit):
     POWER_STAGE_OVERTEMP_ERROR = (5, _E, "power stage too hot",
         "Stop and let the ESC cool. Then give it more air, or reduce the load.", 0x4210)
     BEC_UNDERVOLTAGE = (6, _E, "BEC voltage too low",
-        "Stop soon: receiver and servos may fail. Check the battery, the BEC's wiring and the current of the servos.", 0x5114)
+        ("Stop soon: receiver and servos may fail. "
+         "Check the battery, the BEC's wiring and the current of the servos."), 0x5114)
     BEC_OVERVOLTAGE = (7, _E, "BEC voltage too high",
-        "Check what else supplies the receiver: a second BEC, a backup battery. If nothing does, have the ESC checked.", 0x5115)
+        ("Check what else supplies the receiver: a second BEC, a backup battery. "
+         "If nothing does, have the ESC checked."), 0x5115)
     BEC_OVERCURRENT = (8, _E, "BEC current too high",
-        "Look for a blocked or short-circuited servo. If all servos work, reduce the load on the BEC.", 0x2220)
+        ("Look for a blocked or short-circuited servo. "
+         "If all servos work, reduce the load on the BEC."), 0x2220)
     BEC_OVERTEMPERATURE = (9, _E, "BEC too hot",
         "Reduce the load on the BEC. Let the ESC cool and give it more air.", 0x4410)
     SWITCHED_OFF_BY_RUNNING_DOWN = (10, _S, "switched off by running down (in speed control)",
@@ -122,15 +131,18 @@ class OperatingError(ErrorBit):
     CAPACITY_LIMIT_REACHED = (11, _W, "set capacity limit reached",
         "Stop and charge the battery. The limit is a setting of the ESC.")
     OPERATING_ERROR_FOUND = (12, _E, "summary: an operating error was found",
-        "Follow the remedy of the other error that is set. If no other error is set, see the operating state.", 0x1000, True)
+        ("Follow the remedy of the other error that is set. "
+         "If no other error is set, see the operating state."), 0x1000, True)
     OPERATING_WARNING_FOUND = (13, _W, "summary: an operating warning was found",
         "Follow the remedy of the other warning that is set.", None, True)
     SELFTEST_ERROR = (14, _E, "self-test failed: see the self-test error bits",
         "Do not run the motor. Follow the remedy of the self-test error that is set.", 0x5000)
     EEPROM_ERROR = (15, _E, "EEPROM error",
-        "Switch the ESC off and on. If the error persists, set up the ESC again. If it still persists, have the ESC checked.", 0x5530)
+        ("Switch the ESC off and on. If the error persists, set up the ESC again. "
+         "If it still persists, have the ESC checked."), 0x5530)
     WATCHDOG_ERROR_TRIPPED = (16, _E, "the ESC's watchdog had tripped",
-        "Switch the ESC off and on. If the error returns, have the ESC checked, because its program had hung.", 0x6010)
+        ("Switch the ESC off and on. "
+         "If the error returns, have the ESC checked, because its program had hung."), 0x6010)
     PROGRAMMING_ALLOWED = (17, _S, "programming still allowed (set in every idle frame: no alarm)",
         "Nothing to do.", None, False, True)
     LIMIT_BATTERY_VOLTAGE_MINIMUM = (18, _W, "preset threshold: battery voltage minimum",
@@ -140,9 +152,11 @@ class OperatingError(ErrorBit):
     LIMIT_POWER_STAGE_TEMPERATURE = (20, _W, "preset threshold: power stage temperature",
         "Reduce the load, or give the ESC more air. The threshold is a setting of the ESC.")
     LIMIT_BEC_TEMPERATURE = (21, _W, "preset threshold: BEC temperature",
-        "Reduce the load on the BEC, or give the ESC more air. The threshold is a setting of the ESC.")
+        ("Reduce the load on the BEC, or give the ESC more air. "
+         "The threshold is a setting of the ESC."))
     LIMIT_BEC_CURRENT = (22, _W, "preset threshold: BEC current",
-        "Reduce the load on the BEC, and look for a blocked servo. The threshold is a setting of the ESC.")
+        ("Reduce the load on the BEC, and look for a blocked servo. "
+         "The threshold is a setting of the ESC."))
     LIMIT_DISCHARGED_CAPACITY = (23, _W, "preset threshold: discharged capacity",
         "Stop and charge the battery. The threshold is a setting of the ESC.")
 
@@ -155,27 +169,34 @@ class SelfTestError(ErrorBit):
     TEST_PHASE_HIGH_SIDE = (1, _E, "motor phase high side does not switch",
         "Check the motor's wires and plugs for a short. If there is none, have the ESC checked.")
     TEST_SHORT_TO_GROUND = (2, _E, "short to GND or rest level",
-        "Unplug the battery. Look for a short between the motor's wires, or to ground. If there is none, have the ESC checked.")
+        ("Unplug the battery. Look for a short between the motor's wires, or to ground. "
+         "If there is none, have the ESC checked."))
     TEST_BACK_EMF_OFFSET = (3, _E, "back-EMF offset",
-        "Wait until the motor has stopped, then switch on again. If the error persists, have the ESC checked.")
+        ("Wait until the motor has stopped, then switch on again. "
+         "If the error persists, have the ESC checked."))
     TEST_CURRENT_ZERO_POINT = (4, _E, "current zero point",
-        "Wait until the motor has stopped, then switch on again. If the error persists, have the ESC checked.")
+        ("Wait until the motor has stopped, then switch on again. "
+         "If the error persists, have the ESC checked."))
     TEST_UNDERVOLTAGE = (5, _E, "undervoltage",
         "Charge or check the battery. Check its connectors and cables.")
     TEST_OVERVOLTAGE = (6, _E, "overvoltage",
         "Check that the number of cells suits the ESC.")
     TEST_BEC_UNDERVOLTAGE = (7, _E, "BEC undervoltage",
-        "Reduce the load on the BEC: unplug the servos one by one. If the error persists, have the ESC checked.")
+        ("Reduce the load on the BEC: unplug the servos one by one. "
+         "If the error persists, have the ESC checked."))
     TEST_BEC_OVERVOLTAGE = (8, _E, "BEC overvoltage",
-        "Check what else supplies the receiver: a second BEC, a backup battery. If nothing does, have the ESC checked.")
+        ("Check what else supplies the receiver: a second BEC, a backup battery. "
+         "If nothing does, have the ESC checked."))
     TEST_REVERSE_POLARITY_FUSE = (9, _E, "reverse-polarity fuse",
         "Unplug the battery and check its polarity. If it is right, have the ESC checked.")
     TEST_OVERVOLTAGE_FUSE = (10, _E, "overvoltage fuse",
-        "Unplug the battery and check that its number of cells suits the ESC. If it does, have the ESC checked.")
+        ("Unplug the battery and check that its number of cells suits the ESC. "
+         "If it does, have the ESC checked."))
     TEST_POWER_STAGE_OVERTEMP = (11, _E, "power stage overtemperature",
         "Let the ESC cool, then switch on again.")
     TEST_BEC_OVERTEMPERATURE = (12, _E, "BEC overtemperature",
-        "Let the ESC cool, then switch on again. If the error persists, reduce the load on the BEC.")
+        ("Let the ESC cool, then switch on again. "
+         "If the error persists, reduce the load on the BEC."))
     TEST_MOTOR_PHASE_MISSING = (13, _E, "not all three motor phases connected",
         "Check all three wires and plugs between ESC and motor, and the motor's winding.")
     TEST_EEPROM_EMPTY = (14, _E, "EEPROM empty",
@@ -185,9 +206,11 @@ class SelfTestError(ErrorBit):
     TEST_EEPROM_CHECKSUM = (16, _E, "EEPROM checksum",
         "Set up the ESC again. If the error persists, have the ESC checked.")
     TEST_EEPROM_SIZE = (17, _E, "EEPROM size",
-        "Set up the ESC again, as after a firmware update. If the error persists, have the ESC checked.")
+        ("Set up the ESC again, as after a firmware update. "
+         "If the error persists, have the ESC checked."))
     TEST_EEPROM_VERSION = (18, _E, "EEPROM version",
-        "Set up the ESC again, as after a firmware update. If the error persists, have the ESC checked.")
+        ("Set up the ESC again, as after a firmware update. "
+         "If the error persists, have the ESC checked."))
 
 
 # fmt: on
