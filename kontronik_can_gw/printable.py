@@ -17,8 +17,16 @@ def printable(text: str, keep: str = "") -> str:
 
 
 def printable_json(
-    document: object, indent: int | None = None, ascii_only: bool = False, allow_nan: bool = True
+    document: object,
+    indent: int | None = None,
+    ascii_only: bool = False,
+    allow_nan: bool = True,
 ) -> str:
     """Return JSON with unprintable characters as escapes. Reading it gives the same value."""
-    text = json.dumps(document, indent=indent, ensure_ascii=ascii_only, allow_nan=allow_nan)
+    text = json.dumps(
+        document,
+        indent=indent,
+        ensure_ascii=ascii_only,
+        allow_nan=allow_nan,
+    )
     return "".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)

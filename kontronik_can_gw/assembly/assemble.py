@@ -124,7 +124,11 @@ def check_devices(config: Config) -> None:
         raise UserError(*problems)
 
 
-def _configured(config: Config, machine: Machine, problems: list[str]) -> list[OutputSetup]:
+def _configured(
+    config: Config,
+    machine: Machine,
+    problems: list[str],
+) -> list[OutputSetup]:
     """Return the setups of the enabled outputs, without stored parameters.
 
     Adds mistakes in their tables and files to ``problems``.
@@ -137,7 +141,11 @@ def _configured(config: Config, machine: Machine, problems: list[str]) -> list[O
     return setups
 
 
-def _load_warning(config: Config, layout: Layout, setups: Sequence[OutputSetup]) -> list[str]:
+def _load_warning(
+    config: Config,
+    layout: Layout,
+    setups: Sequence[OutputSetup],
+) -> list[str]:
     """Return a warning of the bus load in a list, or an empty list. UserError if it is too high."""
     can = config.can
     usual = {setup.title: setup.traffic()[1] for setup in setups}
@@ -157,7 +165,10 @@ class _DbcRead:
 
 
 def _compile_dbc(
-    config: Config, escs: list[EscSettings], problems: list[str], taken: dict[int, str]
+    config: Config,
+    escs: list[EscSettings],
+    problems: list[str],
+    taken: dict[int, str],
 ) -> _DbcRead:
     """Read and compile the DBC. Adds mistakes in it to ``problems``."""
     read = _DbcRead()

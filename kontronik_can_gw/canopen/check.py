@@ -39,7 +39,10 @@ _MANDATORY = {(0x1000, 0), (0x1001, 0), (0x1018, 1)}
 
 
 def check_eds(
-    eds: Eds, shipped: Eds, escs: Sequence[EscSettings], node_ids: Iterable[int] = (1,)
+    eds: Eds,
+    shipped: Eds,
+    escs: Sequence[EscSettings],
+    node_ids: Iterable[int] = (1,),
 ) -> None:
     """Check that nodes with these node-IDs, for these ESCs, can be built from an EDS.
 
@@ -100,7 +103,11 @@ def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
             yield entry, f"must be 0x{last:02X}, the highest sub-index."
 
 
-def _reference(known: Mapping[Place, Entry], index: int, sub: int) -> Entry | None:
+def _reference(
+    known: Mapping[Place, Entry],
+    index: int,
+    sub: int,
+) -> Entry | None:
     """Return the entry of the shipped EDS that an entry must be like, or None.
 
     All PDOs are like the first one. Members that the shipped EDS lacks are like sub-index 1.

@@ -77,7 +77,10 @@ def pdo_text(nodes: Nodes, escs: Sequence[EscSettings]) -> str:
 
 
 def _make_names_unique(
-    message: MessageRow, prefix: str, message_names: Names, signal_names: Names
+    message: MessageRow,
+    prefix: str,
+    message_names: Names,
+    signal_names: Names,
 ) -> None:
     """Set names that begin with ``prefix`` and are unique in the file."""
     message.name = message_names.make_unique(prefix or "Esc", message.name)

@@ -121,7 +121,11 @@ def _error_word(
 
 
 def _describe_value(
-    signal: SignalRow, bound: Bound, protocol: EscProtocol, low: int, high: int
+    signal: SignalRow,
+    bound: Bound,
+    protocol: EscProtocol,
+    low: int,
+    high: int,
 ) -> None:
     """Set name, unit, factor, limits and value names of a value of the ESC or the gateway.
 
@@ -175,7 +179,9 @@ def _link(start: int, comment: str) -> list[SignalRow]:
 
 
 def _named(
-    name: str, names: Mapping[int, str], protocol: EscProtocol
+    name: str,
+    names: Mapping[int, str],
+    protocol: EscProtocol,
 ) -> tuple[dict[int, str], str]:
     """Return value names and signal name of a source.
 

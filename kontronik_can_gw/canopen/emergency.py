@@ -83,7 +83,12 @@ class Emergencies:
             self.history.clear()
 
         bind(0x1001, read=lambda _now: self.register)
-        bind(0x1003, read=lambda _now: len(self.history), check=_only_zero, written=clear)
+        bind(
+            0x1003,
+            read=lambda _now: len(self.history),
+            check=_only_zero,
+            written=clear,
+        )
         for variable in self._dictionary.subs(0x1003):
             variable.read = partial(self._read_history, variable.entry.sub)
         bind(0x1014, check=self._check_cob_id)
@@ -117,7 +122,13 @@ class Emergencies:
         pending = self._last_ns + self._inhibit_ns if self._pending else NEVER
         return min(self._delayed_since, pending)
 
-    def set_word(self, word: int, now: int, at: int | None = None, force: bool = False) -> None:
+    def set_word(
+        self,
+        word: int,
+        now: int,
+        at: int | None = None,
+        force: bool = False,
+    ) -> None:
         """Take over the ESC's error word from a live frame that arrived ``at``.
 
         ``force`` evaluates the word even if it did not change, because the mask changed.

@@ -60,7 +60,10 @@ class Nmt:
     """
 
     def __init__(
-        self, dictionary: Dictionary, self_start: bool, entered: Callable[[int], None]
+        self,
+        dictionary: Dictionary,
+        self_start: bool,
+        entered: Callable[[int], None],
     ) -> None:
         self.state = NmtState.INITIALISING
         self._dictionary = dictionary

@@ -69,7 +69,13 @@ class Node:
     called.
     """
 
-    def __init__(self, number: int, setup: NodeSetup, core: OutputHost, host: NodeHost) -> None:
+    def __init__(
+        self,
+        number: int,
+        setup: NodeSetup,
+        core: OutputHost,
+        host: NodeHost,
+    ) -> None:
         self.esc = esc = core.escs[number]
         self.due = NEVER
         """The time at which ``advance`` must be called."""
@@ -304,7 +310,13 @@ class Node:
             for tpdo in self.tpdos:
                 tpdo.start(now)
 
-    def _watch_changed(self, node_id: int, lost: bool, now: int, at: int) -> None:
+    def _watch_changed(
+        self,
+        node_id: int,
+        lost: bool,
+        now: int,
+        at: int,
+    ) -> None:
         """Report that a watched heartbeat is missing since ``at``, or is back."""
         self.emergencies.set(GatewayError.HEARTBEAT_LOST, lost, now, node_id, at)
         if lost:

@@ -74,7 +74,10 @@ def configured_settings(base: EscSettings) -> dict[int, int]:
 
 
 def make_dictionary(
-    eds: Eds, base: EscSettings, settings: NodeSettings, stored: Stored
+    eds: Eds,
+    base: EscSettings,
+    settings: NodeSettings,
+    stored: Stored,
 ) -> Dictionary:
     """Return the dictionary of a node before its first reset.
 

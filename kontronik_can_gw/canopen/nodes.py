@@ -308,7 +308,9 @@ class _CanFaults:
 
 
 def nodes_alone(
-    setups: Sequence[NodeSetup], escs: Sequence[EscSettings], message_ids: Mapping[int, str]
+    setups: Sequence[NodeSetup],
+    escs: Sequence[EscSettings],
+    message_ids: Mapping[int, str],
 ) -> Nodes:
     """Return nodes without a gateway, to read their COB-IDs and objects.
 

@@ -62,7 +62,10 @@ class SdoServer:
     """
 
     def __init__(
-        self, objects: Dictionary, send: Callable[[bytes], None], segment_ns: int = 0
+        self,
+        objects: Dictionary,
+        send: Callable[[bytes], None],
+        segment_ns: int = 0,
     ) -> None:
         self._objects = objects
         self._send = send

@@ -104,7 +104,11 @@ def segmented_upload(answer: bytes, data: bytes) -> Transfer:
 
 
 def block_download(
-    answer: bytes, size: int | None, limit: int, with_crc: bool, sub_block: SubBlock
+    answer: bytes,
+    size: int | None,
+    limit: int,
+    with_crc: bool,
+    sub_block: SubBlock,
 ) -> Transfer:
     """Receive segments in sequence. The client repeats all after the last accepted one.
 
@@ -149,7 +153,11 @@ def block_download(
 
 
 def block_upload(
-    answer: bytes, data: bytes, block_size: int, with_crc: bool, outgoing: deque[bytes]
+    answer: bytes,
+    data: bytes,
+    block_size: int,
+    with_crc: bool,
+    outgoing: deque[bytes],
 ) -> Transfer:
     """Send a sub-block at a time by putting it into ``outgoing``.
 

@@ -148,7 +148,12 @@ class CanopenSetup(OutputSetup):
                 notes.append(file.warning)
             if file.fault is not None:
                 faults.append((number, file.fault))
-        return replace(self, stored=tuple(stored), faults=tuple(faults), notes=tuple(notes))
+        return replace(
+            self,
+            stored=tuple(stored),
+            faults=tuple(faults),
+            notes=tuple(notes),
+        )
 
     def fitted(self, message_ids: Mapping[int, str]) -> "CanopenSetup":
         """Return the setup without the stored node-IDs and COB-IDs that clash.

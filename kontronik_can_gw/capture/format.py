@@ -354,7 +354,12 @@ def _partial_magic(buffer: bytearray) -> int:
     return 0
 
 
-def _payload(buffer: bytearray, deflated: int, stored: int, size: int) -> bytes | None:
+def _payload(
+    buffer: bytearray,
+    deflated: int,
+    stored: int,
+    size: int,
+) -> bytes | None:
     """Return the inflated payload of the block at the buffer's beginning.
 
     None if the CRC or the length is wrong.

@@ -45,7 +45,13 @@ class RecordedGateway(Gateway):
         self._note(now, Kind.STOP)
         super().stop(now)
 
-    def receive_bytes(self, esc: int, data: bytes, now: int, since: int) -> None:
+    def receive_bytes(
+        self,
+        esc: int,
+        data: bytes,
+        now: int,
+        since: int,
+    ) -> None:
         self._note(now, Kind.BYTES, esc, data, came=since)
         super().receive_bytes(esc, data, now, since)
 

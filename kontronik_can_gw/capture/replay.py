@@ -40,7 +40,10 @@ class Replay:
     """
 
     def __init__(
-        self, gateway: Gateway, state: Mapping[str, Any] | None = None, marked: bool = False
+        self,
+        gateway: Gateway,
+        state: Mapping[str, Any] | None = None,
+        marked: bool = False,
     ) -> None:
         self.gateway = gateway
         self.lost = 0

@@ -87,15 +87,32 @@ def integer(low: int, high: int, also: int | None = None) -> Kind:
 def number(low: float, high: float) -> Kind:
     """Accept a number from ``low`` to ``high``."""
     problem = f"is outside {low}..{high}"
-    return _plain(f"{low} … {high}", problem, type="number", minimum=low, maximum=high)
+    return _plain(
+        f"{low} … {high}",
+        problem,
+        type="number",
+        minimum=low,
+        maximum=high,
+    )
 
 
-def pattern(span: str, form: str, problem: str, **limits: int) -> Kind:
+def pattern(
+    span: str,
+    form: str,
+    problem: str,
+    **limits: int,
+) -> Kind:
     """Accept a text that matches the regular expression ``form``.
 
     In the error, ``problem`` follows the refused text.
     """
-    return _plain(span, problem, type="string", pattern=f"^{form}$", **limits)
+    return _plain(
+        span,
+        problem,
+        type="string",
+        pattern=f"^{form}$",
+        **limits,
+    )
 
 
 def choice(*choices: str) -> Kind:

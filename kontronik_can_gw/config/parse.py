@@ -94,14 +94,25 @@ def _make_config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, l
     config = None
     if not problems:
         warnings = tuple(f"{file}: {text}" for text in removed)
-        config = Config(**cast(Any, made), esc=tuple(escs.values()), file=file, warnings=warnings)
+        config = Config(
+            **cast(Any, made),
+            esc=tuple(escs.values()),
+            file=file,
+            warnings=warnings,
+        )
     problems += _esc_problems(escs)
     if config is not None:
         problems += _output_problems(config)
     return config, [f"{file}: {text}" for text in problems]
 
 
-def _make_table(given: Any, name: str, place: str, problems: list[str], removed: list[str]) -> Any:
+def _make_table(
+    given: Any,
+    name: str,
+    place: str,
+    problems: list[str],
+    removed: list[str],
+) -> Any:
     """Return the object of a table, or None if the table is invalid.
 
     Adds mistakes to ``problems``, and a line for each removed key to ``removed``.

@@ -61,7 +61,13 @@ class Core(Protocol):
 
     # --- ESCs
 
-    def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
+    def receive(
+        self,
+        esc: int,
+        data: bytes,
+        now: int,
+        since: int,
+    ) -> None:
         """Take bytes of one ESC that were read at ``now``.
 
         ``since`` is a time at which none of these bytes had arrived yet. Their age counts from it

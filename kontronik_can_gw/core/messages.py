@@ -79,7 +79,11 @@ class _Message(Traits):
     """The state of one message."""
 
     def __init__(
-        self, index: int, plan: MessagePlan, silent_on_loss: bool, first_cycle: int
+        self,
+        index: int,
+        plan: MessagePlan,
+        silent_on_loss: bool,
+        first_cycle: int,
     ) -> None:
         super().__init__(plan, silent_on_loss)
         self.index = index

@@ -51,7 +51,13 @@ class PythonCore:
 
     # --- ESCs
 
-    def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
+    def receive(
+        self,
+        esc: int,
+        data: bytes,
+        now: int,
+        since: int,
+    ) -> None:
         state = self._expired(esc, now)
         for events in state.receive_each(data, now, since):
             self._report(esc, events, now)

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 
 def copies_of(
-    database: "Database", file: str, escs: Sequence[EscSettings], settings: DbcConfig
+    database: "Database",
+    file: str,
+    escs: Sequence[EscSettings],
+    settings: DbcConfig,
 ) -> list[Copy]:
     """Return the messages of a DBC for these ESCs.
 
@@ -74,7 +77,12 @@ def _messages_of_each(messages: Sequence["Message"], binder: Binder) -> set[int]
     return found
 
 
-def _chosen(database: "Database", node: str, patterns: Sequence[str], file: str) -> list["Message"]:
+def _chosen(
+    database: "Database",
+    node: str,
+    patterns: Sequence[str],
+    file: str,
+) -> list["Message"]:
     """Return the messages of other nodes, and those of ``node`` that match one of the patterns.
 
     Without patterns all messages are returned. Raises UserError for a pattern without a match.
@@ -124,7 +132,12 @@ def _problems(copies: Sequence[Copy], node: str) -> Iterator[str]:
         yield f"{problem}: {listed(too_long)}. {remedy}"
 
 
-def _step(ids: Sequence[tuple[int, bool, bool]], count: int, wanted: int | None, file: str) -> int:
+def _step(
+    ids: Sequence[tuple[int, bool, bool]],
+    count: int,
+    wanted: int | None,
+    file: str,
+) -> int:
     """Return the distance of the ids of adjacent ESCs.
 
     This is ``wanted``, or the smallest distance without a clash. ``ids`` contains for each message

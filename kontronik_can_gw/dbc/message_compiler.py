@@ -80,7 +80,11 @@ def _is_empty(message: "Message") -> bool:
     return message.is_container or message.length == 0 or not message.signals
 
 
-def _frame_problems(job: Compilation, message: "Message", where: str) -> Iterator[str]:
+def _frame_problems(
+    job: Compilation,
+    message: "Message",
+    where: str,
+) -> Iterator[str]:
     if _is_fd(message) and not job.fd_allowed:
         yield (
             f"{where}: is a CAN FD message ({message.length} bytes). "
@@ -131,7 +135,10 @@ def _placement_problems(message: "Message", where: str) -> Iterator[str]:
 
 
 def _page_problems(
-    message: "Message", pages: Sequence[int], signals: Sequence[SignalPlan], where: str
+    message: "Message",
+    pages: Sequence[int],
+    signals: Sequence[SignalPlan],
+    where: str,
 ) -> Iterator[str]:
     """Yield problems of multiplexer values that do not fit, and of multiplexed protection."""
     for multiplexer in message.signals:
@@ -151,7 +158,10 @@ def _page_problems(
 
 
 def _crc_problems(
-    job: Compilation, copy: Copy, signals: Sequence[SignalPlan], where: str
+    job: Compilation,
+    copy: Copy,
+    signals: Sequence[SignalPlan],
+    where: str,
 ) -> Iterator[str]:
     """Yield the problems of a checksum, and add a warning if its meaning is assumed.
 
@@ -208,7 +218,11 @@ def _meanings() -> dict[str, str]:
     return found
 
 
-def _timing(job: Compilation, message: "Message", where: str) -> tuple[SendType, int, int]:
+def _timing(
+    job: Compilation,
+    message: "Message",
+    where: str,
+) -> tuple[SendType, int, int]:
     """Return send type, cycle time and minimum distance in ns."""
     cycle = 0
     # the last two are for messages that are sent only in an active state; here they always are
@@ -236,7 +250,12 @@ def _timing(job: Compilation, message: "Message", where: str) -> tuple[SendType,
     return send_type, cycle, delay
 
 
-def _time(job: Compilation, message: "Message", name: str, where: str) -> int:
+def _time(
+    job: Compilation,
+    message: "Message",
+    name: str,
+    where: str,
+) -> int:
     """Return an attribute in ms as exact ns. 0 if it is not set.
 
     Adds a line to the problems for a value that is not a time, and a warning for a time below 1 ms.

@@ -105,7 +105,10 @@ def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
 
 
 def _clashes(
-    copies: Sequence[Copy], node: str, taken: Mapping[int, str], file: str
+    copies: Sequence[Copy],
+    node: str,
+    taken: Mapping[int, str],
+    file: str,
 ) -> Iterator[str]:
     """Yield the problems of ids and names that are used twice, and of ids that are taken.
 
@@ -138,7 +141,11 @@ def _clashes(
             )
 
 
-def _unused_settings(job: Compilation, ours: Sequence[Copy], node: str) -> Iterator[str]:
+def _unused_settings(
+    job: Compilation,
+    ours: Sequence[Copy],
+    node: str,
+) -> Iterator[str]:
     """Yield the problems of settings that do not apply to any of the gateway's messages."""
     settings = job.settings
     file = job.file
@@ -158,7 +165,11 @@ def _unused_settings(job: Compilation, ours: Sequence[Copy], node: str) -> Itera
 
 
 def _unmet(
-    table: str, given: Iterable[str], met: Iterable[str], condition: str, file: str
+    table: str,
+    given: Iterable[str],
+    met: Iterable[str],
+    condition: str,
+    file: str,
 ) -> Iterator[str]:
     for text in sorted(set(given) - set(met)):
         near = did_you_mean(text, met, 0.3, show=repr)

@@ -92,7 +92,12 @@ def text(value: Fraction) -> str:
     return f"{float(value):.10g}"
 
 
-def constant(signal: "Signal", value: float, factor: Fraction, offset: Fraction) -> int | None:
+def constant(
+    signal: "Signal",
+    value: float,
+    factor: Fraction,
+    offset: Fraction,
+) -> int | None:
     """Return the raw bits of a constant physical value. Floats are rounded.
 
     None if the signal cannot contain the value.
@@ -109,7 +114,9 @@ def constant(signal: "Signal", value: float, factor: Fraction, offset: Fraction)
 
 
 def limits(
-    signal: "Signal", factor: Fraction, offset: Fraction
+    signal: "Signal",
+    factor: Fraction,
+    offset: Fraction,
 ) -> tuple[Fraction, Fraction] | None:
     """Return minimum and maximum of the file as raw values.
 

@@ -76,7 +76,11 @@ def read_dbc(path: Path) -> bytes:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> "Database":
+def parse_database(
+    raw: bytes,
+    path: str,
+    warnings: list[str] | None = None,
+) -> "Database":
     """Parse the bytes of a DBC file.
 
     Entries that refer to missing signals, tables or attributes are ignored, with a line in
@@ -105,7 +109,10 @@ def parse_database(raw: bytes, path: str, warnings: list[str] | None = None) -> 
             warnings.append(f"{path}: ignored entries {reason}: {listed(entries)}")
     try:
         database = cantools.database.load_string(
-            rewriting.result, database_format="dbc", strict=False, sort_signals=None
+            rewriting.result,
+            database_format="dbc",
+            strict=False,
+            sort_signals=None,
         )
     except Exception as error:  # cantools raises errors of many types for other text than a DBC
         reason = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
@@ -253,7 +260,10 @@ def listed(names: Iterable[str], limit: int = 6) -> str:
 
 
 def choose_node(
-    database: "Database", wanted: str | None, file: str, patterns: Sequence[str] = ()
+    database: "Database",
+    wanted: str | None,
+    file: str,
+    patterns: Sequence[str] = (),
 ) -> str:
     """Return the transmitter node whose messages the gateway sends.
 

@@ -215,7 +215,12 @@ class SignalCompiler:
         hints = self.job.binder.suggestions(name)
         raise UnfitSignal(f"no such source{via}.{hints} Bind it under [dbc.bind] or rename it.")
 
-    def _bound(self, plan: SignalPlan, value: Value, esc: int | None) -> SignalPlan:
+    def _bound(
+        self,
+        plan: SignalPlan,
+        value: Value,
+        esc: int | None,
+    ) -> SignalPlan:
         escs = self.job.binder.escs
         if esc is None and value.group is not Group.GATEWAY:
             examples = " or ".join(f"{e.name}.{value.name}" for e in escs[:2])
@@ -257,7 +262,10 @@ class SignalCompiler:
 
 
 def _bound_plan(
-    plan: SignalPlan, table: ValueTable, value: Value, on_loss: int | None
+    plan: SignalPlan,
+    table: ValueTable,
+    value: Value,
+    on_loss: int | None,
 ) -> SignalPlan:
     """Return the plan of a signal with ``value`` as its source.
 
@@ -265,7 +273,13 @@ def _bound_plan(
     UnfitSignal if the signal cannot show the value.
     """
     slope, intercept = _scale(plan, value)
-    plan = replace(plan, role=Role.SOURCE, source=value, slope=slope, intercept=intercept)
+    plan = replace(
+        plan,
+        role=Role.SOURCE,
+        source=value,
+        slope=slope,
+        intercept=intercept,
+    )
     numbers = table.numbers(value)
     notes = [*_notes_on_names(value, numbers)]
     low = plan.low
@@ -321,4 +335,10 @@ def _flag(plan: SignalPlan, on_loss: int | None) -> SignalPlan:
         return plan
     code = raws[on_loss]
     # an "Error" in the value table at 0 or 1 is a value, not a code
-    return replace(plan, not_available=code, error=code, low=min(raws), high=max(raws))
+    return replace(
+        plan,
+        not_available=code,
+        error=code,
+        low=min(raws),
+        high=max(raws),
+    )

@@ -71,7 +71,9 @@ class MessageRow:
 
 
 def copies_text(
-    database: "Database", copies: Sequence[Copy] | None = None, version: str | None = None
+    database: "Database",
+    copies: Sequence[Copy] | None = None,
+    version: str | None = None,
 ) -> str:
     """Return a database as text.
 
@@ -187,7 +189,12 @@ def _message(sent: Copy) -> MessageRow:
     )
 
 
-def _signal(signal: "Signal", name: str, prefix: str, in_pages: bool) -> SignalRow:
+def _signal(
+    signal: "Signal",
+    name: str,
+    prefix: str,
+    in_pages: bool,
+) -> SignalRow:
     """Return the row of a signal.
 
     ``in_pages``: its message has several multiplexers, or several pages for a signal, and therefore

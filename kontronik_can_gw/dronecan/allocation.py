@@ -53,7 +53,13 @@ class Allocation:
         payload = ALLOCATION.pack(is_first) + part
         return transfer(can_id, ALLOCATION.seed, payload, self._transfer_id)
 
-    def receive(self, source: int, payload: bytes, taken: set[int], now: int) -> int | None:
+    def receive(
+        self,
+        source: int,
+        payload: bytes,
+        taken: set[int],
+        now: int,
+    ) -> int | None:
         """Process an Allocation message. Returns the node-ID that was allocated to us, or None.
 
         ``source`` is the allocator's node-ID, or 0 if the message is the request of another

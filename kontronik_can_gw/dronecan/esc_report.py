@@ -123,7 +123,11 @@ _LAYOUTS: Mapping[DataType, _Layout] = {
 
 
 @cache
-def plans_of(protocol: EscProtocol, speed: str, has_direction: bool) -> Mapping[DataType, SlotPlan]:
+def plans_of(
+    protocol: EscProtocol,
+    speed: str,
+    has_direction: bool,
+) -> Mapping[DataType, SlotPlan]:
     """Return the messages that an ESC of this protocol supplies.
 
     ``speed`` is the value that is sent as rpm. With ``has_direction``, it is negative while the
@@ -144,7 +148,11 @@ def plans_of(protocol: EscProtocol, speed: str, has_direction: bool) -> Mapping[
     return found
 
 
-def _slot_plan(kind: DataType, length: int, signals: tuple[SignalPlan, ...]) -> SlotPlan:
+def _slot_plan(
+    kind: DataType,
+    length: int,
+    signals: tuple[SignalPlan, ...],
+) -> SlotPlan:
     plan = MessagePlan(
         name="transfer",
         can_id=0,

@@ -36,7 +36,12 @@ _ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
 class Node:
     """One DroneCAN node of the gateway."""
 
-    def __init__(self, setup: NodeSetup, given: Given, reports: Sequence[EscReport]) -> None:
+    def __init__(
+        self,
+        setup: NodeSetup,
+        given: Given,
+        reports: Sequence[EscReport],
+    ) -> None:
         self.setup = setup
         self.node_id = setup.node_id
         """0 while the node waits for a node-ID. It sends no messages then."""
@@ -53,7 +58,11 @@ class Node:
             report.start(self.node_id, place, now)
 
     def message(
-        self, kind: DataType, payload: bytes, queued: bool = False, priority: int = wire.LOW
+        self,
+        kind: DataType,
+        payload: bytes,
+        queued: bool = False,
+        priority: int = wire.LOW,
     ) -> list[CanFrame]:
         """Return the frames of a broadcast message. ``queued`` as in CanFrame."""
         count = self._transfer_ids.get(kind.number, 0)
@@ -76,7 +85,12 @@ class Node:
         return wire.NODE_STATUS.pack(uptime_s & 0xFFFFFFFF, health << 6 | mode << 3, code & 0xFFFF)
 
     def answer(
-        self, request_id: int, kind: DataType, request: bytes, transfer_id: int, status: bytes
+        self,
+        request_id: int,
+        kind: DataType,
+        request: bytes,
+        transfer_id: int,
+        status: bytes,
     ) -> list[CanFrame]:
         """Return the frames of the response to a request. Empty if the request is malformed.
 
@@ -148,7 +162,12 @@ class Dronecan(Output):
     name = "dronecan"
     events = Event.STATE
 
-    def __init__(self, setups: Sequence[NodeSetup], given: Given, host: OutputHost) -> None:
+    def __init__(
+        self,
+        setups: Sequence[NodeSetup],
+        given: Given,
+        host: OutputHost,
+    ) -> None:
         super().__init__()
         self._gateway = host.status
         self._table = table = given.table
@@ -295,11 +314,21 @@ class Dronecan(Output):
         for report in self._reports:
             report.log_again()
 
-    def _send_node_status(self, node: Node, now: int, mode: int = wire.OPERATIONAL) -> None:
+    def _send_node_status(
+        self,
+        node: Node,
+        now: int,
+        mode: int = wire.OPERATIONAL,
+    ) -> None:
         status = self._status_of(node, now, mode)
         self.frames += node.message(wire.NODE_STATUS, status, priority=wire.LOWEST)
 
-    def _status_of(self, node: Node, now: int, mode: int = wire.OPERATIONAL) -> bytes:
+    def _status_of(
+        self,
+        node: Node,
+        now: int,
+        mode: int = wire.OPERATIONAL,
+    ) -> bytes:
         bus_is_well = self._gateway.can_state not in (CanState.ERROR_PASSIVE, CanState.BUS_OFF)
         return node.status((now - self._gateway.started_ns) // SECOND, mode, bus_is_well)
 

@@ -112,7 +112,13 @@ class Assembler:
         its CRC and payload received so far.
         """
 
-    def receive(self, can_id: int, data: bytes, seed: int, now: int) -> bytes | None:
+    def receive(
+        self,
+        can_id: int,
+        data: bytes,
+        seed: int,
+        now: int,
+    ) -> bytes | None:
         """Process a frame. Returns the payload of the transfer that it completes, or None.
 
         ``seed`` is the seed of the transfer's type.

@@ -124,7 +124,12 @@ _OUTPUT = Divisor.OUTPUT
 _PRODUCT = Kind.PRODUCT
 
 
-def steps(value: Value, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> int | None:
+def steps(
+    value: Value,
+    esc: EscTelemetry,
+    gateway: GatewayStatus,
+    now: int,
+) -> int | None:
     """Return the value at ``now`` in steps, not divided yet. None if not available."""
     if value.read is not None:
         return value.read(esc, gateway, now)
@@ -133,7 +138,11 @@ def steps(value: Value, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> 
     return steps_of(value, esc, esc.last_info if value.last else esc.info)
 
 
-def steps_of(value: Value, esc: EscTelemetry, reading: Sequence[int] | None) -> int | None:
+def steps_of(
+    value: Value,
+    esc: EscTelemetry,
+    reading: Sequence[int] | None,
+) -> int | None:
     """Return the value in a live or info reading in steps, not divided yet.
 
     None without a reading, if the ESC's device does not supply the value, or if the value is not
@@ -166,7 +175,12 @@ def divisor(value: Value, esc: EscTelemetry) -> tuple[int, int] | None:
     return (cells, 1) if cells else None
 
 
-def scaled(value: Value, esc: EscTelemetry, count: int | None, slope: Fraction) -> int | None:
+def scaled(
+    value: Value,
+    esc: EscTelemetry,
+    count: int | None,
+    slope: Fraction,
+) -> int | None:
     """Return ``count`` steps x ``slope`` / divisor, rounded once to a whole number, halves up.
 
     None if the steps or the divisor are not available.
@@ -179,7 +193,11 @@ def scaled(value: Value, esc: EscTelemetry, count: int | None, slope: Fraction) 
     return (2 * numerator + denominator) // (2 * denominator)
 
 
-def physical(value: Value, esc: EscTelemetry, count: int | None) -> float | None:
+def physical(
+    value: Value,
+    esc: EscTelemetry,
+    count: int | None,
+) -> float | None:
     """Return ``count`` steps in the value's ``unit``.
 
     The result is an integer if one step is one unit, else a float rounded to six decimals. None if
@@ -233,8 +251,18 @@ def _derived_values(live: Mapping[str, Value]) -> Iterator[Value]:
     voltage = live.get("battery_voltage")
     current = live.get("battery_current")
     if speed is not None:
-        yield replace(speed, name="motor_speed", unit="1/min", divisor=Divisor.POLE_PAIRS)
-        yield replace(speed, name="output_speed", unit="1/min", divisor=Divisor.OUTPUT)
+        yield replace(
+            speed,
+            name="motor_speed",
+            unit="1/min",
+            divisor=Divisor.POLE_PAIRS,
+        )
+        yield replace(
+            speed,
+            name="output_speed",
+            unit="1/min",
+            divisor=Divisor.OUTPUT,
+        )
     if voltage is not None and current is not None:
         voltages = (voltage.low or 0, voltage.high or 0)
         currents = (current.low or 0, current.high or 0)
@@ -270,7 +298,11 @@ def _energy_mw_s(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int:
     return esc.energy_mw_ns // SECOND
 
 
-def _data_age_ms(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> int | None:
+def _data_age_ms(
+    esc: EscTelemetry,
+    _gateway: GatewayStatus,
+    now: int,
+) -> int | None:
     return esc.age_ms(now)
 
 
@@ -327,12 +359,25 @@ def _link_values(protocol: EscProtocol) -> Iterator[Value]:
         )
 
 
-def _gateway_value(name: str, unit: str = "", read: Read | None = None, **more: Any) -> Value:
+def _gateway_value(
+    name: str,
+    unit: str = "",
+    read: Read | None = None,
+    **more: Any,
+) -> Value:
     """Make a value of the gateway. By default it reads the attribute of GatewayStatus ``name``."""
     if read is None:
         get = operator.attrgetter(name.removeprefix("gateway_"))
         read = lambda _esc, gateway, _now: get(gateway)  # noqa: E731
-    return Value(name, unit, Group.GATEWAY, Kind.GATEWAY, read=read, low=0, **more)
+    return Value(
+        name,
+        unit,
+        Group.GATEWAY,
+        Kind.GATEWAY,
+        read=read,
+        low=0,
+        **more,
+    )
 
 
 def _make_gateway_values() -> Iterator[Value]:
@@ -342,7 +387,12 @@ def _make_gateway_values() -> Iterator[Value]:
     yield _gateway_value("esc_count")
     yield _gateway_value("escs_ok")
     uptime: Read = lambda _esc, gateway, now: (now - gateway.started_ns) // MS  # noqa: E731
-    yield _gateway_value("uptime", unit="s", per_unit=1000, read=uptime)
+    yield _gateway_value(
+        "uptime",
+        unit="s",
+        per_unit=1000,
+        read=uptime,
+    )
     for name in (
         "sent_frames",
         "replaced_frames",

@@ -82,7 +82,13 @@ class Gateway:
 
     # --- ESCs
 
-    def receive_bytes(self, esc: int, data: bytes, now: int, since: int) -> None:
+    def receive_bytes(
+        self,
+        esc: int,
+        data: bytes,
+        now: int,
+        since: int,
+    ) -> None:
         """Take bytes of one ESC that were read at ``now``. See ``Core.receive`` for ``since``."""
         self.core.receive(esc, data, now, since)
 

@@ -53,7 +53,9 @@ def compiler() -> str | None:
 
 
 def compile_core(
-    target: Path, options: Sequence[str] = _OPTIMISED, program: str | None = None
+    target: Path,
+    options: Sequence[str] = _OPTIMISED,
+    program: str | None = None,
 ) -> str | None:
     """Make the shared object. Return None, or in one line why it could not be made.
 
@@ -80,7 +82,11 @@ def compile_core(
     return None
 
 
-def _run(program: str, options: Sequence[str], target: Path) -> subprocess.CompletedProcess[str]:
+def _run(
+    program: str,
+    options: Sequence[str],
+    target: Path,
+) -> subprocess.CompletedProcess[str]:
     """Run the compiler with the generated wire.h in a folder of its own."""
     with tempfile.TemporaryDirectory(prefix="kcg-wire.") as folder:
         (Path(folder) / "wire.h").write_text(wire_header(), encoding="ascii")

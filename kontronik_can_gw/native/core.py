@@ -44,7 +44,12 @@ def _array(kind: Any, rows: Any) -> Any:
     return (kind * max(1, len(rows)))(*rows)
 
 
-def _part(memory: Any, kind: Any, count: int, address: int) -> Any:
+def _part(
+    memory: Any,
+    kind: Any,
+    count: int,
+    address: int,
+) -> Any:
     """Return an array in the core's memory."""
     return (kind * count).from_buffer(memory, address - c.addressof(memory))
 
@@ -148,7 +153,12 @@ class NativeCore:
         python = self._slots.add(esc)
         return NativeSlot(self, place, esc, python)
 
-    def write_slot(self, place: Place, esc: int, settings: SlotSettings) -> bool:
+    def write_slot(
+        self,
+        place: Place,
+        esc: int,
+        settings: SlotSettings,
+    ) -> bool:
         """Write the rows of a slot. Return False if the core in C cannot express it."""
         plan = settings.plan
         try:
@@ -174,7 +184,13 @@ class NativeCore:
             self.constants[message.first_word + word] = fill
         return True
 
-    def receive(self, esc: int, data: bytes, now: int, since: int) -> None:
+    def receive(
+        self,
+        esc: int,
+        data: bytes,
+        now: int,
+        since: int,
+    ) -> None:
         _check(esc, now, len(self.escs))
         receive, core = self.library.kcg_receive, self.core
         for begin in range(0, len(data) or 1, KCG.MAX_READ):
@@ -278,7 +294,9 @@ class NativeCore:
 
 
 def _merged(
-    core: NativeCore, frames: list[CanFrame], in_python: list[PendingSlot]
+    core: NativeCore,
+    frames: list[CanFrame],
+    in_python: list[PendingSlot],
 ) -> list[CanFrame]:
     """Return the frames of kcg_take, with those of slots in Python at their places.
 

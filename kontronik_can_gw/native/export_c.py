@@ -29,7 +29,10 @@ _WIDTH = 118
 
 
 def exported(
-    layout: Layout, escs: Sequence[EscSettings], silent_on_loss: bool, licence: str
+    layout: Layout,
+    escs: Sequence[EscSettings],
+    silent_on_loss: bool,
+    licence: str,
 ) -> dict[str, str]:
     """Return the text of each file by its name.
 
@@ -85,7 +88,12 @@ def _options(layout: Layout, tables: Tables) -> dict[str, int]:
     }
 
 
-def _header(dbc: str, tables: Tables, names: Sequence[str], escs: Sequence[EscSettings]) -> str:
+def _header(
+    dbc: str,
+    tables: Tables,
+    names: Sequence[str],
+    escs: Sequence[EscSettings],
+) -> str:
     """Return tables.h: names of messages and ESCs, with their numbers, ids and lengths."""
     places = _names("KCG_ESC_", [esc.name for esc in escs])
     rows = []
@@ -140,7 +148,11 @@ def _type(name: str, kind: Any) -> str:
     return f"uint{8 * ctypes.sizeof(kind)}_t"
 
 
-def _rows(kind: Any, rows: Sequence[Any], labels: Sequence[str] | None) -> Iterator[str]:
+def _rows(
+    kind: Any,
+    rows: Sequence[Any],
+    labels: Sequence[str] | None,
+) -> Iterator[str]:
     """Yield the lines of a table's rows. Fields that are 0 are left out."""
     if not issubclass(kind, ctypes.Structure):
         values = [getattr(row, "value", row) for row in rows]

@@ -39,7 +39,13 @@ class FrameRoom:
         c.memmove(other.frames, c.addressof(self.frames) + size * begin, size * count)
         c.memmove(other.times, c.addressof(self.times) + 8 * begin, 8 * count)
 
-    def candump(self, begin: int, end: int, shift_ns: int, channel: str) -> memoryview:
+    def candump(
+        self,
+        begin: int,
+        end: int,
+        shift_ns: int,
+        channel: str,
+    ) -> memoryview:
         """Return lines of a candump log (see Frames.candump)."""
         name = channel.encode()
         count = end - begin
@@ -170,7 +176,12 @@ class Lines:
                 self._longest += max((len(text) for _, text in words), default=0)
 
     def of(
-        self, rows: Rows, begin: int, end: int, origin_ns: int, wall_ns: int
+        self,
+        rows: Rows,
+        begin: int,
+        end: int,
+        origin_ns: int,
+        wall_ns: int,
     ) -> Iterator[bytes | int]:
         """Yield lines of the rows ``begin`` to ``end``, or the index of a row that C cannot write.
 

@@ -60,7 +60,9 @@ class Rows:
 
 
 def bind_direction(
-    row: Any, negative_in: tuple[int, frozenset[int]], places: list[tuple[int, int]]
+    row: Any,
+    negative_in: tuple[int, frozenset[int]],
+    places: list[tuple[int, int]],
 ) -> None:
     """Make a row of live data negative in some states.
 

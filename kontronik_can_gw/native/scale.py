@@ -114,7 +114,12 @@ def _set_integer_scale(row: Any, signal: SignalPlan, value: Value) -> None:
     row.most = most
 
 
-def _most(row: Any, signal: SignalPlan, value: Value, scale: tuple[int, int, int]) -> int:
+def _most(
+    row: Any,
+    signal: SignalPlan,
+    value: Value,
+    scale: tuple[int, int, int],
+) -> int:
     """Return the largest absolute number of steps that the core has to multiply.
 
     Beyond it, in either direction, the signal cannot hold the value, whatever the divisor is, and
@@ -157,7 +162,10 @@ def _bits_of(number: float) -> int:
 
 
 def _fitting_factor(
-    row: Any, signal: SignalPlan, value: Value, set_one: Callable[..., None]
+    row: Any,
+    signal: SignalPlan,
+    value: Value,
+    set_one: Callable[..., None],
 ) -> str:
     """Return a hint with a factor that the core can express, or "".
 

@@ -121,7 +121,12 @@ class SlotHost(Protocol):
     core: Any
     """The address of kcg."""
 
-    def write_slot(self, place: Place, esc: int, settings: SlotSettings) -> bool:
+    def write_slot(
+        self,
+        place: Place,
+        esc: int,
+        settings: SlotSettings,
+    ) -> bool:
         """Write the rows of a slot. Return False if the core in C cannot express it."""
 
     def choose_events(self) -> None:
@@ -134,7 +139,13 @@ class NativeSlot:
     ``place`` is None if C has no room for it.
     """
 
-    def __init__(self, host: SlotHost, place: Place | None, esc: int, python: PythonSlot) -> None:
+    def __init__(
+        self,
+        host: SlotHost,
+        place: Place | None,
+        esc: int,
+        python: PythonSlot,
+    ) -> None:
         self._host = host
         self._place = place
         self._esc = esc

@@ -55,7 +55,10 @@ class Tables:
     """The tables of the core for a layout."""
 
     def __init__(
-        self, layout: Layout, escs: Sequence[EscSettings], silent_on_loss: bool = False
+        self,
+        layout: Layout,
+        escs: Sequence[EscSettings],
+        silent_on_loss: bool = False,
     ) -> None:
         self._plans = layout.messages
         self.signals = Rows(Signal)
@@ -179,7 +182,12 @@ class Tables:
         self.messages.append(row)
         self.pages += len(plan.pages)
 
-    def _add_signal(self, signal: SignalPlan, plan: MessagePlan, has_crc: bool) -> None:
+    def _add_signal(
+        self,
+        signal: SignalPlan,
+        plan: MessagePlan,
+        has_crc: bool,
+    ) -> None:
         if signal.length > MAX_BITS:
             raise NotInCore(f"{plan.name}.{signal.name}: too long ({signal.length} bits)")
         first_piece = len(self.pieces)
@@ -241,7 +249,12 @@ _NAME_OF = {"received_bytes": "bytes", "live_counter": "live_frames"}
 """Values that have another name in COUNTS."""
 
 
-def bind(row: Any, value: Value, places: Places, esc: int | None) -> None:
+def bind(
+    row: Any,
+    value: Value,
+    places: Places,
+    esc: int | None,
+) -> None:
     """Enter the source of a value into a row of Signal. Raises NotInCore if the core has none."""
     row.divisor = _DIVISORS[value.divisor]
     name = _NAME_OF.get(value.name, value.name)

@@ -63,7 +63,11 @@ def compile_pack(plan: MessagePlan) -> Pack:
     pages = [_compile_page(plan, page) for page in plan.pages]
 
     def pack(
-        escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int, alive: int, at: int
+        escs: Sequence[EscTelemetry],
+        gateway: GatewayStatus,
+        now: int,
+        alive: int,
+        at: int,
     ) -> int:
         bits, sources = pages[at]
         for pieces, read_raw in sources:
@@ -81,7 +85,11 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
     crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
 
     def make_frame(
-        escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int, alive: int, at: int
+        escs: Sequence[EscTelemetry],
+        gateway: GatewayStatus,
+        now: int,
+        alive: int,
+        at: int,
     ) -> CanFrame:
         data = pack(escs, gateway, now, alive, at).to_bytes(plan.length, "little")
         if crc is not None:
@@ -136,7 +144,11 @@ def _compile_whole(signal: SignalPlan) -> _ReadRaw:
     factor = int(signal.slope * common)
     offset = int(signal.intercept * common)
 
-    def read_raw(escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> int:
+    def read_raw(
+        escs: Sequence[EscTelemetry],
+        gateway: GatewayStatus,
+        now: int,
+    ) -> int:
         esc = escs[index]
         count = steps(source, esc, gateway, now)
         if count is None:
@@ -166,7 +178,11 @@ def _compile_enumeration(signal: SignalPlan, numbers: Mapping[int, int]) -> _Rea
     error = signal.error
     not_available = signal.not_available
 
-    def read_raw(escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> int:
+    def read_raw(
+        escs: Sequence[EscTelemetry],
+        gateway: GatewayStatus,
+        now: int,
+    ) -> int:
         esc = escs[index]
         count = steps(source, esc, gateway, now)
         if count is None or divisor(source, esc) is None:
@@ -186,7 +202,11 @@ def _compile_float(signal: SignalPlan) -> _ReadRaw:
     error = signal.error
     not_available = signal.not_available
 
-    def read_raw(escs: Sequence[EscTelemetry], gateway: GatewayStatus, now: int) -> int:
+    def read_raw(
+        escs: Sequence[EscTelemetry],
+        gateway: GatewayStatus,
+        now: int,
+    ) -> int:
         esc = escs[index]
         count = steps(source, esc, gateway, now)
         if count is None:
@@ -203,7 +223,11 @@ def _compile_float(signal: SignalPlan) -> _ReadRaw:
     return read_raw
 
 
-def _scale_to_float(signal: SignalPlan, count: int, parts: tuple[int, int]) -> float | None:
+def _scale_to_float(
+    signal: SignalPlan,
+    count: int,
+    parts: tuple[int, int],
+) -> float | None:
     """Return the number to send for ``count`` steps and this divisor, computed with one division.
 
     None for a number that the signal's value table does not contain.

@@ -234,7 +234,10 @@ class Layout:
         return f"{crc:08X}"
 
     def bus_load(
-        self, bitrate: int, data_bitrate: int = 2_000_000, is_worst: bool = False
+        self,
+        bitrate: int,
+        data_bitrate: int = 2_000_000,
+        is_worst: bool = False,
     ) -> float:
         """Return the share of the bus that the messages need at these rates in bit/s.
 

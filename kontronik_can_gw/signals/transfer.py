@@ -18,7 +18,12 @@ _BYTES_PER_FRAME = 7
 
 
 def transfer(
-    can_id: int, seed: int, payload: bytes, transfer_id: int, queued: bool = False, page: int = 0
+    can_id: int,
+    seed: int,
+    payload: bytes,
+    transfer_id: int,
+    queued: bool = False,
+    page: int = 0,
 ) -> list[CanFrame]:
     """Return the frames of a transfer.
 

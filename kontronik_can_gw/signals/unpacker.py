@@ -283,7 +283,11 @@ def _is_flag(signal: SignalPlan) -> bool:
 
 
 def float_value(
-    bits: int, length: int, codes: tuple[int, ...], factor: float, offset: float
+    bits: int,
+    length: int,
+    codes: tuple[int, ...],
+    factor: float,
+    offset: float,
 ) -> float | None:
     """Return the physical value of a float signal. None for its codes and for NaN."""
     if bits in codes:

@@ -289,7 +289,13 @@ class Deframer:
             self._drop(buffer, at, start, "dropped_incomplete")
         return start
 
-    def _reject(self, buffer: bytes, at: int, length: int, reason: str) -> None:
+    def _reject(
+        self,
+        buffer: bytes,
+        at: int,
+        length: int,
+        reason: str,
+    ) -> None:
         """Drop a header, in which no other frame can begin.
 
         ``length`` bytes from its start are counted under ``reason`` if they are dropped, too.
@@ -299,7 +305,13 @@ class Deframer:
         self._rejected_until = max(self._rejected_until, self._base + at + length)
         self._drop(buffer, at, at + 4)
 
-    def _drop(self, buffer: bytes, begin: int, end: int, reason: str = "dropped_noise") -> None:
+    def _drop(
+        self,
+        buffer: bytes,
+        begin: int,
+        end: int,
+        reason: str = "dropped_noise",
+    ) -> None:
         """Count dropped bytes: the part of a rejected frame under its reason, the rest as given."""
         counters = self.counters
         dropped = buffer[begin:end]

@@ -52,11 +52,22 @@ def _whole_fields(data: DataType) -> list[Field]:
 
 def _state_field(name: str, names: Mapping[int, str] = NO_NAMES) -> Field:
     word = LiveData._fields.index("operating_state")
-    return Field(name, unit="", word=word, low=0, high=255, names=names)
+    return Field(
+        name,
+        unit="",
+        word=word,
+        low=0,
+        high=255,
+        names=names,
+    )
 
 
 def _info_bits(
-    name: str, row: str, shift: int, mask: int, names: Mapping[int, str] = NO_NAMES
+    name: str,
+    row: str,
+    shift: int,
+    mask: int,
+    names: Mapping[int, str] = NO_NAMES,
 ) -> Field:
     """Return the field ``row >> shift & mask`` of info data."""
     return Field(
@@ -80,7 +91,13 @@ KONTRONIK = EscProtocol(
         _state_field("operating_state", _STATE_NAMES),
         _state_field("operating_state_raw"),
         *_whole_fields(InfoData),
-        _info_bits("device", "device_and_variant", shift=VARIANT_BITS, mask=0x3F, names=_DEVICES),
+        _info_bits(
+            "device",
+            "device_and_variant",
+            shift=VARIANT_BITS,
+            mask=0x3F,
+            names=_DEVICES,
+        ),
         _info_bits("device_raw", "device_and_variant", shift=VARIANT_BITS, mask=0x3F),
         _info_bits("variant", "device_and_variant", shift=0, mask=(1 << VARIANT_BITS) - 1),
         _info_bits("firmware_main", "firmware_word", shift=8, mask=0xFF),

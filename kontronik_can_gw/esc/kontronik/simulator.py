@@ -90,7 +90,11 @@ class FlightModel:
     """Battery, motor and temperatures of one ESC, in steps of ``period_s`` since its power-up."""
 
     def __init__(
-        self, profile: Sequence[Phase], period_s: float, device: Device, seed: int
+        self,
+        profile: Sequence[Phase],
+        period_s: float,
+        device: Device,
+        seed: int,
     ) -> None:
         self._profile = profile
         self._device = device
@@ -317,7 +321,12 @@ class Sent(NamedTuple):
 class SimulatedEsc:
     """One simulated ESC. The first frame leaves at ``start_ns``."""
 
-    def __init__(self, options: EscOptions | None = None, seed: int = 0, start_ns: int = 0) -> None:
+    def __init__(
+        self,
+        options: EscOptions | None = None,
+        seed: int = 0,
+        start_ns: int = 0,
+    ) -> None:
         options = options or EscOptions()
         faults = options.faults
         self.next_ns = start_ns
