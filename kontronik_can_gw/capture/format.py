@@ -149,7 +149,8 @@ def block(kind: bytes, number: int, payload: bytes) -> bytes:
 
 def json_payload(content: Mapping[str, Any]) -> bytes:
     """Encode a header or information block."""
-    return json.dumps(content, ensure_ascii=False, sort_keys=True).encode("utf-8", "surrogatepass")
+    text = json.dumps(content, ensure_ascii=False, sort_keys=True)
+    return text.encode("utf-8", "surrogatepass")
 
 
 def read_json(payload: bytes) -> dict[str, Any]:
@@ -258,7 +259,8 @@ COUNTERS = (
 
 def numbers_data(*numbers: int) -> bytes:
     """Return numbers as the data of an entry. Each is a u64; negative numbers become 0."""
-    return struct.pack(f"<{len(numbers)}Q", *[max(0, number) for number in numbers])
+    not_negative = [max(0, number) for number in numbers]
+    return struct.pack(f"<{len(numbers)}Q", *not_negative)
 
 
 def read_numbers(data: bytes) -> tuple[int, ...]:

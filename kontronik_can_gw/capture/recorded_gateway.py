@@ -57,7 +57,8 @@ class RecordedGateway(Gateway):
 
     def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
         self._note_line_errors(now)
-        self._note(now, Kind.FRAME, data=frame_data(frame), came=at)
+        data = frame_data(frame)
+        self._note(now, Kind.FRAME, data=data, came=at)
         super().receive_frame(frame, now, at)
 
     def held_up(self, now: int, dropped: bool) -> None:
@@ -73,8 +74,9 @@ class RecordedGateway(Gateway):
         super().receive_overrun(now)
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
+        has_failed = error is not None
         reason = (error or "").encode()
-        self._note(now, Kind.SAVED, esc, reason, flags=int(error is not None))
+        self._note(now, Kind.SAVED, esc, reason, flags=int(has_failed))
         super().saved(esc, error, now)
 
     def parameters_damaged(self, esc: int, now: int) -> None:
@@ -101,8 +103,7 @@ class RecordedGateway(Gateway):
 
     def take_frames(self, now: int) -> list[CanFrame]:
         frames = super().take_frames(now)
-        # usually all of them are sent, so only other changes of the counter are recorded
-        self._counters = (self._counters[0] + len(frames), *self._counters[1:])
+        self._expect_sent(len(frames))
         return frames
 
     def not_sent(self, now: int) -> None:
@@ -115,15 +116,22 @@ class RecordedGateway(Gateway):
 
     def turned(self, calls: Iterable[Call], frames: int) -> None:
         """Record the calls of the core by turns in C. ``frames``: number of frames taken."""
-        self._counters = (self._counters[0] + frames, *self._counters[1:])
+        self._expect_sent(frames)
         for now, kind, esc, data, came in calls:
             self._put(now, kind, esc, data, 0, came)
 
+    def _expect_sent(self, frames: int) -> None:
+        """Count frames as sent. Usually all are, so only other changes need to be recorded."""
+        sent, *others = self._counters
+        self._counters = (sent + frames, *others)
+
     def _note_line_errors(self, now: int) -> None:
-        for esc, (state, known) in enumerate(zip(self.escs, self._line_errors, strict=True)):
-            if state.line_errors != known:
-                self._line_errors[esc] = state.line_errors
-                self._put(now, Kind.LINE_ERRORS, esc, numbers_data(state.line_errors), 0, None)
+        for index, esc in enumerate(self.escs):
+            line_errors = esc.line_errors
+            if line_errors != self._line_errors[index]:
+                self._line_errors[index] = line_errors
+                data = numbers_data(line_errors)
+                self._put(now, Kind.LINE_ERRORS, index, data, 0, None)
 
     def _note(
         self,
@@ -141,16 +149,22 @@ class RecordedGateway(Gateway):
         counters = _counters_of(self.status)
         if counters != self._counters:
             self._counters = counters
-            self._put(now, Kind.COUNTERS, 0, numbers_data(*counters), 0, None)
+            data = numbers_data(*counters)
+            self._put(now, Kind.COUNTERS, 0, data, 0, None)
 
 
 def state_of(gateway: Gateway) -> dict[str, Any]:
     """Return the state with which a replay can begin now."""
+    escs = []
+    for esc in gateway.escs:
+        counters = {
+            "energy": esc.energy_mw_ns,
+            "run_time": esc.run_time_ns,
+            "losses": esc.losses,
+        }
+        escs.append(counters)
     return {
-        "escs": [
-            {"energy": esc.energy_mw_ns, "run_time": esc.run_time_ns, "losses": esc.losses}
-            for esc in gateway.escs
-        ],
+        "escs": escs,
         "can_state": int(gateway.status.can_state),
         "started_ns": gateway.status.started_ns,
     }
@@ -160,14 +174,16 @@ def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:
     """Return the device of each ESC according to its last info frame. None before the first."""
     found: list[dict[str, Any] | None] = []
     for esc in gateway.escs:
-        if esc.last_info is None:
+        info = esc.last_info
+        if info is None:
             found.append(None)
             continue
+        protocol = esc.protocol
         device = {
-            "device": esc.protocol.device_text(esc.last_info),
-            "variant": esc.protocol.value("variant", esc.last_info),
-            "firmware": esc.protocol.firmware_text(esc.last_info),
-            "layout": esc.protocol.layout_text(esc.layout) or "",
+            "device": protocol.device_text(info),
+            "variant": protocol.value("variant", info),
+            "firmware": protocol.firmware_text(info),
+            "layout": protocol.layout_text(esc.layout) or "",
         }
         found.append(device)
     return found

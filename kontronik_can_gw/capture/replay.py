@@ -5,7 +5,7 @@ as in a live run, with the recorded times. So frames and times are identical to 
 entry is missing. Nothing waits or is sent.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.capture.format import (
@@ -57,7 +57,7 @@ class Replay:
         self._started = False
         self._midway = False
         """True if the beginning of the run is missing and no STATE entry was found yet."""
-        self._take_up(state or {})
+        self._adopt(state or {})
 
     def follow(self, entries: Iterable[Entry]) -> Iterator[TimedFrame]:
         """Yield the frames that were received and sent, in order."""
@@ -111,17 +111,17 @@ class Replay:
             gateway.receive_bytes(esc, data, now, came)
         elif kind == Kind.ADVANCE:
             gateway.advance(now)
-            self._take(now)
+            self._collect_frames(now)
         elif kind == Kind.FRAME:
             frame = read_frame(data)
             gateway.receive_frame(frame, now, came)
             return [TimedFrame(now, frame, True)]
         elif kind == Kind.START:
             self._start(now, bool(flags))
-            self._take(now)
+            self._collect_frames(now)
         elif kind == Kind.STOP:
             gateway.stop(now)
-            self._take(now)
+            self._collect_frames(now)
         elif kind == Kind.COUNTERS:
             counters = read_numbers(data)
             check_counters(counters)
@@ -136,9 +136,9 @@ class Replay:
                 self._midway = False
                 state = read_json(data)
                 check_state(state)
-                self._take_up(state)
+                self._adopt(state)
         elif kind != Kind.CLOCK:
-            _RARE[kind](gateway, entry)
+            _repeat_rare(gateway, entry)
         return []
 
     def _start(self, now: int, can_open: bool) -> None:
@@ -147,7 +147,7 @@ class Replay:
         if self._marked:
             self.gateway.status.state = GatewayState.REPLAY
 
-    def _take(self, now: int) -> None:
+    def _collect_frames(self, now: int) -> None:
         gateway = self.gateway
         gateway.take_saves()  # otherwise the list would grow
         frames = in_order(gateway.take_frames(now), self._waiting)
@@ -157,9 +157,10 @@ class Replay:
         gateway.conflicts.take()
         self._taken = [TimedFrame(now, frame) for frame in frames]
 
-    def _take_up(self, state: Mapping[str, Any]) -> None:
+    def _adopt(self, state: Mapping[str, Any]) -> None:
         """Adopt the counters from before the recording began."""
-        for esc, found in zip(self.gateway.escs, state.get("escs", ()), strict=False):
+        states = state.get("escs", ())
+        for esc, found in zip(self.gateway.escs, states, strict=False):
             energy = found["energy"]
             run_time = found["run_time"]
             losses = found["losses"]
@@ -172,20 +173,34 @@ class Replay:
             self.gateway.status.can_state = CanState(state["can_state"])
 
 
-_RARE: dict[int, Callable[[Gateway, Entry], object]] = {
-    Kind.PORT_OPENED: lambda gateway, e: gateway.port(e.esc, True, e.time_ns),
-    Kind.PORT_LOST: lambda gateway, e: gateway.port(e.esc, False, e.time_ns),
-    Kind.CAN_OPENED: lambda gateway, e: gateway.can_opened(e.time_ns),
-    Kind.CAN_RETURNED: lambda gateway, e: gateway.can_returned(e.time_ns),
-    Kind.HELD_UP: lambda gateway, e: gateway.held_up(e.time_ns, bool(e.flags)),
-    Kind.CAN_STATE: lambda gateway, e: gateway.set_can_state(CanState(e.flags), e.time_ns),
-    Kind.OVERRUN: lambda gateway, e: gateway.receive_overrun(e.time_ns),
-    Kind.SAVED: lambda gateway, e: gateway.saved(
-        e.esc, e.data.decode("utf-8", "replace") if e.flags else None, e.time_ns
-    ),
-    Kind.DAMAGED: lambda gateway, e: gateway.parameters_damaged(e.esc, e.time_ns),
-}
-"""Calls of the gateway for the rarer kinds. An unknown kind raises KeyError."""
+def _repeat_rare(gateway: Gateway, entry: Entry) -> None:
+    """Repeat a call of one of the rarer kinds. An unknown kind raises KeyError."""
+    now = entry.time_ns
+    esc = entry.esc
+    match entry.kind:
+        case Kind.PORT_OPENED:
+            gateway.port(esc, True, now)
+        case Kind.PORT_LOST:
+            gateway.port(esc, False, now)
+        case Kind.CAN_OPENED:
+            gateway.can_opened(now)
+        case Kind.CAN_RETURNED:
+            gateway.can_returned(now)
+        case Kind.HELD_UP:
+            gateway.held_up(now, bool(entry.flags))
+        case Kind.CAN_STATE:
+            gateway.set_can_state(CanState(entry.flags), now)
+        case Kind.OVERRUN:
+            gateway.receive_overrun(now)
+        case Kind.SAVED:
+            error = None
+            if entry.flags:
+                error = entry.data.decode("utf-8", "replace")
+            gateway.saved(esc, error, now)
+        case Kind.DAMAGED:
+            gateway.parameters_damaged(esc, now)
+        case unknown:
+            raise KeyError(unknown)
 
 
 def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:

@@ -197,8 +197,8 @@ class EscStream(EscTelemetry):
                 bound = self.live_bound_ns
             if live is not None:
                 self._integrate(live, when - before)
-        errors_word = self._errors_word
-        if errors_word is not None and (live is None or live[errors_word] != data[errors_word]):
+        word = self._errors_word
+        if word is not None and (live is None or live[word] != data[word]):
             events |= Event.STATE
         self.live = data
         self.last_live = data
@@ -236,13 +236,15 @@ class EscStream(EscTelemetry):
         if old is None:
             return Event.INFO | Event.STATE
         value = self.protocol.value
-        if any(value(name, data) != value(name, old) for name in ("device_raw", "variant")):
-            return Event.INFO | Event.LINK | Event.STATE
+        for name in ("device_raw", "variant"):
+            if value(name, data) != value(name, old):
+                return Event.INFO | Event.LINK | Event.STATE
         return Event.INFO
 
     def _update_cells(self) -> None:
         """Use the configured number of cells, or else the number in fresh info data."""
-        self.cells = self.settings.cell_count or self.protocol.value("cell_count", self.info) or 0
+        reported = self.protocol.value("cell_count", self.info) or 0
+        self.cells = self.settings.cell_count or reported
 
     def _forget_device(self) -> None:
         self.info = None

@@ -45,12 +45,13 @@ class Traits:
             and bool(plan.paces & {Group.LIVE, Group.INFO})
             and Group.LINK not in plan.paces
         )
-        self.follows_gateway = Group.GATEWAY in plan.paces and (self.by_event or self.on_change)
+        has_events = self.by_event or self.on_change
+        self.follows_gateway = Group.GATEWAY in plan.paces and has_events
         roles = {signal.role: signal for signal in plan.compiled}
         alive = roles.get(Role.ALIVE)
         self.alive_modulus = 0 if alive is None else alive_modulus(alive, Role.CRC in roles)
         self.triggers = Event.NONE
-        if self.by_event or self.on_change:
+        if has_events:
             for pace in plan.paces:
                 self.triggers |= _EVENT_OF_PACE[pace]
             by_live_frames = self.by_event and self.triggers & Event.LIVE
@@ -68,10 +69,14 @@ def phases(cycles: Sequence[int]) -> list[int]:
     for index, cycle in enumerate(cycles):
         members.setdefault(cycle, []).append(index)
     found = [0] * len(cycles)
-    for number, (cycle, indices) in enumerate(sorted(members.items())):
+    groups = len(members)
+    for number, cycle in enumerate(sorted(members)):
+        indices = members[cycle]
+        parts = len(indices) * groups
         for place, index in enumerate(indices):
-            # place / len(indices) of the cycle, plus number / len(members) of the space between two
-            found[index] = cycle * (place * len(members) + number) // (len(indices) * len(members))
+            # place / len(indices) of the cycle, plus number / groups of the space between two
+            part = place * groups + number
+            found[index] = cycle * part // parts
     return found
 
 
@@ -177,17 +182,21 @@ class _Message(Traits):
         if not self.pages_to_send:
             self.turn_page()
         count = len(self.plan.pages)
-        place = min(self.pages_to_send, key=lambda place: (place - self.place) % count)
+        distance = min([(place - self.place) % count for place in self.pages_to_send])
+        place = (self.place + distance) % count
         self.pages_to_send.remove(place)
         return place
 
 
 def own_ids(layout: Layout) -> dict[int, Owner]:
     """Return the ids of the messages (with EXTENDED if they have 29 bits) and their owners."""
-    return {
-        plan.can_id | (EXTENDED if plan.extended else 0): Owner(None, f"message {plan.name}")
-        for plan in layout.messages
-    }
+    owners = {}
+    for plan in layout.messages:
+        key = plan.can_id
+        if plan.extended:
+            key |= EXTENDED
+        owners[key] = Owner(None, f"message {plan.name}")
+    return owners
 
 
 class Messages:
@@ -208,15 +217,19 @@ class Messages:
         self._escs = escs
         self._gateway = gateway
         first = phases([plan.cycle_ns for plan in layout.messages])
-        self._messages = [
-            _Message(index, plan, silent_on_loss, now + phase)
-            for index, (plan, phase) in enumerate(zip(layout.messages, first, strict=True))
-        ]
-        self._of_gateway = [m for m in self._messages if m.follows_gateway]
-        self._of_esc = [
-            [m for m in self._messages if esc in m.plan.escs] for esc in range(len(escs))
-        ]
-        self._timed = [m for m in self._messages if not m.is_untimed]
+        self._messages: list[_Message] = []
+        self._of_gateway: list[_Message] = []
+        self._of_esc: list[list[_Message]] = [[] for _ in escs]
+        self._timed: list[_Message] = []
+        for index, plan in enumerate(layout.messages):
+            message = _Message(index, plan, silent_on_loss, now + first[index])
+            self._messages.append(message)
+            if message.follows_gateway:
+                self._of_gateway.append(message)
+            for esc in plan.escs:
+                self._of_esc[esc].append(message)
+            if not message.is_untimed:
+                self._timed.append(message)
         self.pending: dict[int, int] = {}
         """Indices of the messages that ``take`` sends, and the times at which they became due."""
         self._stopping = False
@@ -266,24 +279,26 @@ class Messages:
         for message in self._of_gateway:
             if message.by_event:
                 message.add_all_pages()
-            self._let_go(message, now, _REQUEST)
+            self._mark_pending(message, now, _REQUEST)
 
     def advance(self, now: int) -> None:
         """Mark messages whose cycle or minimum distance is over."""
         for message in self._timed:
             when, why = message.take_due(now)
             if why:
-                self._let_go(message, when, why)
+                self._mark_pending(message, when, why)
 
     def _request(self, message: _Message, now: int) -> None:
         """Send a message as soon as its minimum distance allows."""
         if message.may_go(now):
-            self._let_go(message, now, _REQUEST)
+            self._mark_pending(message, now, _REQUEST)
         elif self._note_news(message, now):
             message.defer()
 
-    def _let_go(self, message: _Message, since: int, why: int) -> None:
-        self.pending[message.index] = min(since, self.pending.get(message.index, since))
+    def _mark_pending(self, message: _Message, since: int, why: int) -> None:
+        index = message.index
+        earlier = self.pending.get(index, since)
+        self.pending[index] = min(since, earlier)
         message.why |= why
 
     # --- frames
@@ -293,7 +308,8 @@ class Messages:
         pending = self.pending
         self.pending = {}
         frames: list[CanFrame] = []
-        for _, index in sorted((since, index) for index, since in pending.items()):
+        in_order = sorted([(since, index) for index, since in pending.items()])
+        for _, index in in_order:
             message = self._messages[index]
             why = message.why
             message.why = 0
@@ -308,9 +324,11 @@ class Messages:
 
         They are the changed ones if it was requested, and the next one if its cycle is over.
         """
-        if message.is_silent_on_loss and not any(self._escs[esc].up for esc in message.plan.escs):
-            message.pages_to_send.clear()
-            return False
+        if message.is_silent_on_loss:
+            has_telemetry = any(self._escs[esc].up for esc in message.plan.escs)
+            if not has_telemetry:
+                message.pages_to_send.clear()
+                return False
         is_news = bool(why & _REQUEST) and self._note_news(message, now)
         if why & _CYCLE:
             message.turn_page()
@@ -323,11 +341,11 @@ class Messages:
         """
         if message.by_event or not message.on_change:
             return True
-        changed = [
-            place
-            for place in range(len(message.plan.pages))
-            if message.frame(self._escs, self._gateway, now, 0, place) != message.last.get(place)
-        ]
+        changed = []
+        for place in range(len(message.plan.pages)):
+            frame = message.frame(self._escs, self._gateway, now, 0, place)
+            if frame != message.last.get(place):
+                changed.append(place)
         if message.is_paged:
             message.pages_to_send.update(changed)
         return bool(changed or message.pages_to_send)

@@ -237,7 +237,8 @@ class PythonSlot:
         self._deferred_until = NEVER
         self._restart_timer(settings, self._last_ns)
         self._set_due()
-        bits = plan.pack(escs, self._owner.status, now, 0, 0) | settings.fill
+        bits = plan.pack(escs, self._owner.status, now, 0, 0)
+        bits |= settings.fill
         self._last_watched = bits & plan.watched
         self.sent += 1
         data = bits.to_bytes(plan.message.length, "little")
@@ -249,7 +250,8 @@ class PythonSlot:
         return transfer(settings.can_id, plan.seed, data, number, page=settings.page)
 
     def _is_known(self, plan: SlotPlan) -> bool:
-        source, esc = plan.message.signals[0].source, self._escs[0]
+        source = plan.message.signals[0].source
+        esc = self._escs[0]
         assert source is not None
         found = steps(source, esc, self._owner.status, 0)
         return found is not None and divisor(source, esc) is not None
@@ -361,7 +363,9 @@ class Slots:
             return []
         pending = self.pending
         self.pending = {}
-        return [
-            PendingSlot(since, (esc, number), self._of[esc][number].frames(now))
-            for (esc, number), since in sorted(pending.items(), key=itemgetter(1, 0))
-        ]
+        found = []
+        for key, since in sorted(pending.items(), key=itemgetter(1, 0)):
+            esc, number = key
+            frames = self._of[esc][number].frames(now)
+            found.append(PendingSlot(since, key, frames))
+        return found

@@ -139,12 +139,13 @@ def plans_of(
         rpm = with_direction(protocol, rpm)
     found = {}
     for kind, layout in _LAYOUTS.items():
-        signals = tuple(
-            _signal(part, values[part.name] if part.name else rpm) for part in layout.parts
-        )
+        signals = []
+        for part in layout.parts:
+            value = values[part.name] if part.name else rpm
+            signals.append(_signal(part, value))
         if signals[0].source is None or not signals[0].source.supplied:
             continue
-        found[kind] = _slot_plan(kind, layout.length, signals)
+        found[kind] = _slot_plan(kind, layout.length, tuple(signals))
     return found
 
 
@@ -205,7 +206,9 @@ def pieces(at: int, bits: int) -> tuple[Piece, ...]:
         while left:
             width = min(left, 8 - at % 8)
             left -= width
-            found.append(Piece(shift + left, width, at // 8 * 8 + 8 - at % 8 - width))
+            next_byte = at // 8 * 8 + 8
+            low_bit = next_byte - at % 8 - width
+            found.append(Piece(shift + left, width, low_bit))
             at += width
     return tuple(found)
 
@@ -264,13 +267,16 @@ class EscReport:
         values = values_of(esc.protocol)
         self._word = values["operating_errors"]
         self._speed = values["electrical_speed"]
-        self._bits = [
-            bit
-            for bit in esc.protocol.errors.get("operating_errors", ())
-            if bit.severity in _LEVELS and not bit.is_summary
-        ]
-        self._errors = sum(1 << bit for bit in self._bits if bit.severity is Severity.ERROR)
+        self._bits: list[ErrorBit] = []
+        """The bits that are reported."""
+        self._errors = 0
         """The bits of errors in the word."""
+        for bit in esc.protocol.errors.get("operating_errors", ()):
+            if bit.is_summary or bit.severity not in _LEVELS:
+                continue
+            self._bits.append(bit)
+            if bit.severity is Severity.ERROR:
+                self._errors |= 1 << bit
         self._before = 0
         """The word at the last call of ``follow``."""
         self._logged = 0
@@ -285,7 +291,10 @@ class EscReport:
 
     def take_slots(self, slot: Callable[[], Slot]) -> None:
         """Take a slot for each message that is sent. ``slot`` returns a new slot of the ESC."""
-        self._slots = {kind: slot() for kind in self._plans if self._rates[kind]}
+        self._slots = {}
+        for kind in self._plans:
+            if self._rates[kind]:
+                self._slots[kind] = slot()
 
     def start(self, node_id: int, place: int, now: int) -> None:
         """Send measurements as this node. ``place`` is the ESC's position among the node's ESCs."""

@@ -20,7 +20,9 @@ from kontronik_can_gw.signals.transfer import TRANSFER_ID, transfer
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import NEVER, SECOND
 
-SERVICES = {kind.number: kind for kind in (wire.GET_NODE_INFO, wire.RESTART_NODE, wire.GET_SET)}
+_ANSWERED = (wire.GET_NODE_INFO, wire.RESTART_NODE, wire.GET_SET)
+SERVICES = {kind.number: kind for kind in _ANSWERED}
+"""The services that a node offers, by number."""
 _HARDWARE = (1, 0)
 _VALUE_SIZES = (0, 8, 4, 1)
 """Length of a parameter's value by the tag of its union: none, integer, real, boolean."""
@@ -76,13 +78,16 @@ class Node:
         The health of the ESCs is included only if the user has chosen it, because an autopilot does
         not arm while the health of a node is not OK.
         """
-        health = wire.OK if bus_is_well and not self.is_duplicate else wire.WARNING
+        health = wire.OK
+        if self.is_duplicate or not bus_is_well:
+            health = wire.WARNING
         code = 0
         for report in self.reports:
             code |= report.word
             if self._table.health == "esc":
                 health = max(health, report.health)
-        return wire.NODE_STATUS.pack(uptime_s & 0xFFFFFFFF, health << 6 | mode << 3, code & 0xFFFF)
+        state = health << 6 | mode << 3
+        return wire.NODE_STATUS.pack(uptime_s & 0xFFFFFFFF, state, code & 0xFFFF)
 
     def answer(
         self,
@@ -97,21 +102,31 @@ class Node:
         ``request_id`` is the CAN id of the request, and ``status`` the node's present NodeStatus.
         """
         if kind is wire.GET_NODE_INFO:
+            setup = self.setup
             software = (*self._version, 0, 0, 0)
-            answer = wire.GET_NODE_INFO.pack(status, *software, *_HARDWARE, self.setup.unique_id, 0)
-            answer += self.setup.name.encode("ascii")
+            answer = wire.GET_NODE_INFO.pack(status, *software, *_HARDWARE, setup.unique_id, 0)
+            answer += setup.name.encode("ascii")
         elif kind is wire.GET_SET:
             answer = _get_set(request, self._parameters())
         else:
             answer = wire.RESTART_NODE.pack(False)
         if not answer:
             return []
-        return transfer(wire.response_id(request_id), kind.seed, answer, transfer_id, True)
+        return transfer(
+            wire.response_id(request_id),
+            kind.seed,
+            answer,
+            transfer_id,
+            queued=True,
+        )
 
     def _parameters(self) -> dict[str, Parameter]:
         table = self._table
-        found: dict[str, Parameter]
-        found = {name: getattr(table, name) for name in ("rate_hz", "extended_hz", "rpm")}
+        found: dict[str, Parameter] = {
+            "rate_hz": table.rate_hz,
+            "extended_hz": table.extended_hz,
+            "rpm": table.rpm,
+        }
         for report in self.reports:
             esc = report.esc
             name = esc.settings.name
@@ -170,7 +185,8 @@ class Dronecan(Output):
     ) -> None:
         super().__init__()
         self._gateway = host.status
-        self._table = table = given.table
+        table = given.table
+        self._table = table
         self._reports = []
         for number, esc in enumerate(host.escs):
             report = EscReport(esc, table.first_index + number, table)
@@ -241,13 +257,16 @@ class Dronecan(Output):
         can_id = frame.can_id
         source = can_id & NODE
         if not can_id & SERVICE:
-            number = can_id >> 8 & (0xFFFF if source else 3)
+            number_bits = 0xFFFF if source else 3  # a sender without a node-ID has two bits only
+            number = can_id >> 8 & number_bits
             if number == wire.ALLOCATION.number and self._allocation.due != NEVER:
-                self._take_allocation(frame, source, now)
+                self._receive_allocation(frame, source, now)
+            return
+        if not can_id & REQUEST or not source:
             return
         node = self._by_id.get(can_id >> 8 & NODE)
         kind = SERVICES.get(can_id >> 16 & 0xFF)
-        if node is None or kind is None or not can_id & REQUEST or not source:
+        if node is None or kind is None:
             return
         request = self._assembler.receive(can_id, frame.data, kind.seed, now)
         if request is None:
@@ -265,14 +284,16 @@ class Dronecan(Output):
 
     def own_ids(self) -> dict[int, Owner]:
         """Return the ids that have one of our nodes as their source."""
-        return {
-            id_block(node.node_id, NODE): Owner(number, f"DroneCAN node-ID {node.node_id}")
-            for number, node in enumerate(self._nodes)
-            if node.node_id
-        }
+        owners = {}
+        for number, node in enumerate(self._nodes):
+            if node.node_id:
+                owner = Owner(number, f"DroneCAN node-ID {node.node_id}")
+                owners[id_block(node.node_id, NODE)] = owner
+        return owners
 
     def take_news(self) -> list[LogLine]:
-        news, self._news = self._news, []
+        news = self._news
+        self._news = []
         return news
 
     def facts(self) -> dict[str, Any]:
@@ -285,8 +306,14 @@ class Dronecan(Output):
             if not node.node_id:
                 state = f"waits for a node-ID, {self._allocation.requests} requests"
             name = node.setup.name
-            nodes.append({"node_id": node.node_id or None, "name": name, "state": state})
-            lines.append(" ".join(f"DroneCAN {node.node_id or ''} {name}: {state}".split()))
+            fact = {
+                "node_id": node.node_id or None,
+                "name": name,
+                "state": state,
+            }
+            nodes.append(fact)
+            number = f"{node.node_id} " if node.node_id else ""
+            lines.append(f"DroneCAN {number}{name}: {state}")
         return {
             "lines": lines,
             "nodes": nodes,
@@ -306,9 +333,13 @@ class Dronecan(Output):
             report.follow(0, now)
         for node in self._by_id.values():
             self._send_node_status(node, now)
-            for report in node.reports if self._table.log_messages else ():
-                for message in report.log(now):
-                    self.frames += node.message(wire.LOG_MESSAGE, message, queued=True)
+            if self._table.log_messages:
+                self._send_log(node, now)
+
+    def _send_log(self, node: Node, now: int) -> None:
+        for report in node.reports:
+            for message in report.log(now):
+                self.frames += node.message(wire.LOG_MESSAGE, message, queued=True)
 
     def _log_again(self) -> None:
         for report in self._reports:
@@ -329,37 +360,50 @@ class Dronecan(Output):
         now: int,
         mode: int = wire.OPERATIONAL,
     ) -> bytes:
-        bus_is_well = self._gateway.can_state not in (CanState.ERROR_PASSIVE, CanState.BUS_OFF)
-        return node.status((now - self._gateway.started_ns) // SECOND, mode, bus_is_well)
+        gateway = self._gateway
+        bus_is_well = gateway.can_state not in (CanState.ERROR_PASSIVE, CanState.BUS_OFF)
+        uptime_s = (now - gateway.started_ns) // SECOND
+        return node.status(uptime_s, mode, bus_is_well)
 
     # --- node-IDs
 
     def _ask(self, now: int) -> None:
         """Ask for the node-ID of the first node that has none."""
-        waiting = [node.setup.unique_id for node in self._nodes if not node.node_id]
-        self._allocation.ask(waiting[0] if waiting else b"", now)
+        node = self._first_waiting()
+        unique_id = b"" if node is None else node.setup.unique_id
+        self._allocation.ask(unique_id, now)
         self._follow_ids()
 
-    def _take_allocation(self, frame: CanFrame, source: int, now: int) -> None:
-        payload = self._assembler.receive(frame.can_id, frame.data, wire.ALLOCATION.seed, now)
+    def _first_waiting(self) -> Node | None:
+        """Return the first node without a node-ID."""
+        return next((node for node in self._nodes if not node.node_id), None)
+
+    def _receive_allocation(self, frame: CanFrame, source: int, now: int) -> None:
+        seed = wire.ALLOCATION.seed
+        payload = self._assembler.receive(frame.can_id, frame.data, seed, now)
         if payload is None:
             return
-        node_id = self._allocation.receive(source, payload, set(self._by_id), now)
-        if node_id is not None:
-            node = next(node for node in self._nodes if not node.node_id)
-            node.node_id = node_id
-            text = f"DroneCAN node {node.setup.name}: has node-ID {node_id}"
-            self._news.append(LogLine(text, text))
-            self.revision += 1
-            self._second_due = now  # the node reports itself at once
-            node.start(now)
-            self._ask(now)
+        taken = set(self._by_id)
+        node_id = self._allocation.receive(source, payload, taken, now)
+        node = self._first_waiting()
+        if node_id is None or node is None:
+            return
+        node.node_id = node_id
+        text = f"DroneCAN node {node.setup.name}: has node-ID {node_id}"
+        self._news.append(LogLine(text, text))
+        self.revision += 1
+        self._second_due = now  # the node reports itself at once
+        node.start(now)
+        self._ask(now)
 
     def _follow_ids(self) -> None:
         """Update the ids to receive after a change of node-IDs."""
         self._by_id = {node.node_id: node for node in self._nodes if node.node_id}
         requests = SERVICE | REQUEST
         mask = requests | NODE << 8
-        blocks = frozenset(id_block(requests | node_id << 8, mask) for node_id in self._by_id)
-        is_waiting = len(self._by_id) < len(self._nodes)
-        self.receive_ids = blocks | _ALLOCATIONS if is_waiting else blocks
+        blocks = set()
+        for node_id in self._by_id:
+            blocks.add(id_block(requests | node_id << 8, mask))
+        if self._first_waiting() is not None:
+            blocks |= _ALLOCATIONS
+        self.receive_ids = frozenset(blocks)

@@ -82,7 +82,8 @@ class DronecanSetup(OutputSetup):
 
     def header(self) -> dict[str, Any]:
         given = self.given
-        table, identity = asdict(given.table), given.identity.hex()
+        table = asdict(given.table)
+        identity = given.identity.hex()
         return given._asdict() | {"table": table, "identity": identity}
 
     def taken_ids(self) -> Mapping[int, str]:

@@ -142,8 +142,10 @@ class Assembler:
         payload += data[:-1]
         is_late = now - since > TIMEOUT_NS
         if tail & END:
-            if not is_late and crc_hqx(payload[2:], seed) == int.from_bytes(payload[:2], "little"):
-                return payload[2:]
+            content = payload[2:]
+            crc = int.from_bytes(payload[:2], "little")
+            if not is_late and crc_hqx(content, seed) == crc:
+                return content
             self.errors += 1
         elif is_late or len(data) < 8 or len(payload) > MAX_PAYLOAD:
             self.errors += 1
