@@ -90,7 +90,10 @@ def _run(words: list[str]) -> int:
             discard_output()
             say(f"standard output: cannot be written: {error.strerror}", command)
         elif error.errno in (errno.EMFILE, errno.ENFILE):
-            say("too few files may be open: raise ulimit -n (of a service LimitNOFILE)", command)
+            say(
+                "too many open files. Raise the limit: ulimit -n, for a service LimitNOFILE",
+                command,
+            )
         elif error.filename is not None and command != "run":
             say(f"{error.filename}: {error.strerror}", command)
         else:

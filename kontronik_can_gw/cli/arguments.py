@@ -72,7 +72,7 @@ class Parser(argparse.ArgumentParser):
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
             near = did_you_mean(str(value).lower(), map(str, action.choices), or_known=True)
-            raise argparse.ArgumentError(action, f"there is no {value!r}.{near}")
+            raise argparse.ArgumentError(action, f"{value!r} is unknown.{near}")
 
 
 class Option(NamedTuple):
@@ -133,7 +133,7 @@ def number_from(
         except ValueError:
             value = float("nan")
         if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a {what}, {low:g} to {high:g}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a {what} from {low:g} to {high:g}")
         return value
 
     return read
@@ -186,8 +186,8 @@ def config_file(given: Path | None) -> Path:
     found = given or default_config()
     if found is None:
         raise UserError(
-            f"there is no {_DEFAULTS}. Name the configuration: -c FILE; "
-            "kontronik-can-gw init writes an example."
+            f"no configuration: neither {CONFIG_PLACES[0]} nor {CONFIG_PLACES[1]} exists. "
+            "Give one with -c FILE, or write an example with kontronik-can-gw init."
         )
     return found
 

@@ -41,8 +41,8 @@ def main(args: argparse.Namespace) -> int:
         print(printable_json(result, indent=2))
         return error.exit_code
     examples = [
-        f"{loaded.config.file}: port of {esc.name}: {esc.port} is the example's. "
-        "Write the name of yours: ls /dev/serial/by-id"
+        f"{loaded.config.file}: port of {esc.name}: {esc.port} is the example's port. "
+        "Write the name of your port: ls /dev/serial/by-id"
         for esc in loaded.config.esc
         if _EXAMPLE_PORT in esc.port
     ]
@@ -97,7 +97,7 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     worst = shown["worst_bus_load"]
     worst_frames = shown["worst_frames_per_second"]
     if worst_frames > frames:
-        condition = "while all that is sent on change changes"
+        condition = "if every value changes all the time"
         yield f"  at worst  {worst:.1%}, {worst_frames:.0f} frames/s: {condition}"
 
 
@@ -113,7 +113,7 @@ def details(loaded: Loaded) -> Iterator[str]:
             yield from ("", *lines)
     if loaded.database is not None:
         bus = BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
-        text = markdown("What is sent", [], dbc(bus, loaded.escs))
+        text = markdown("Messages", [], dbc(bus, loaded.escs))
         yield from ("", *text.splitlines())
 
 

@@ -107,7 +107,7 @@ def canopen_of(loaded: Loaded) -> "CanopenSetup":
     setup = canopen_setup(loaded)
     if setup is None:
         raise UserError(
-            f"{loaded.config.file}: canopen.enabled is false: there are no CANopen nodes. "
+            f"{loaded.config.file}: canopen.enabled is false, so there are no CANopen nodes. "
             "Set it to true."
         )
     return setup

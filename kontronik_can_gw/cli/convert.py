@@ -49,10 +49,10 @@ def _seconds_ns(text: str) -> int:
 
 
 def _names(text: str) -> list[str]:
-    """Return the names in a text with commas between them. A type for argparse."""
+    """Return the names in a text, separated by commas. A type for argparse."""
     found = [name.strip() for name in text.split(",") if name.strip()]
     if not found:
-        raise argparse.ArgumentTypeError("give names of signals, with commas between")
+        raise argparse.ArgumentTypeError("give names of signals, separated by commas")
     return found
 
 
@@ -65,7 +65,7 @@ OPTIONS = (
     option("-q --quiet", "print no summary"),
     LAYOUT,
     LOG_CHANNEL,
-    "a part of it",
+    "part of the recording",
     option(
         "--from S", "from this time after the start, in seconds", type=_seconds_ns, dest="start"
     ),
@@ -127,7 +127,7 @@ def main(args: argparse.Namespace, opened_by: OpenInput = open_input) -> int:
     try:
         return _convert(args, form, opened_by)
     except KeyboardInterrupt:
-        say("stopped: nothing is written" if args.output != "-" else "stopped", args.command)
+        say("stopped: nothing was written" if args.output != "-" else "stopped", args.command)
         return _STOPPED
 
 
@@ -178,14 +178,14 @@ def _report(
 def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
     """Return the reason why there is nothing to convert."""
     if args.start is not None or args.end is not None:
-        return "nothing in it is between --from and --until"
+        return "has no data between --from and --until"
     if recording.others:
         return (
-            f"nothing in it can be converted: no frame of {recording.bus.layout.file}. "
-            "Give the right DBC by --dbc or -c."
+            f"has no frame of {recording.bus.layout.file}, so there is nothing to convert. "
+            "Give its DBC with --dbc or -c."
         )
     missing = "values" if form in TABLES else "frames"
-    return f"nothing in it can be converted: it has no {missing}."
+    return f"has no {missing}, so there is nothing to convert"
 
 
 def _conversion(args: argparse.Namespace, form: str, recording: Input) -> Callable[..., str | None]:
@@ -206,7 +206,9 @@ def _format(args: argparse.Namespace) -> str:
     if args.to:
         return str(args.to)
     if args.output == "-":
-        raise UserError(f"standard output takes only text. Give --to {' or '.join(ON_SCREEN)}.")
+        raise UserError(
+            f"standard output: only for text formats. Give --to {' or '.join(ON_SCREEN)}."
+        )
     suffix = Path(args.output).suffix.lower()
     if suffix == ".mf4":
         raise UserError(f"{args.output}: {REMOVED_OPTIONS['convert', '--to mf4']}")
@@ -225,29 +227,32 @@ def _check(args: argparse.Namespace, form: str) -> None:
     has_end = args.end is not None
     if to_screen and form not in ON_SCREEN:
         raise UserError(
-            f"{form} cannot go to standard output. "
-            f"Give a file, or one of these: {', '.join(ON_SCREEN)}"
+            f"{form}: cannot be written to standard output. "
+            f"Give a file, or one of these formats: {', '.join(ON_SCREEN)}"
         )
     if args.signals and form not in TABLES:
-        raise UserError(f"--signals is for tables ({', '.join(TABLES)}), not for {form}")
+        raise UserError(f"--signals: is for tables ({', '.join(TABLES)}), not for {form}")
     if args.esc is not None and form != BYTES:
         raise UserError(
-            f"--esc is for bin, not for {form}; leave it out, or --signals 'NAME.*' of several ESCs"
+            f"--esc: is for bin, not for {form}. Leave it out, or choose one of several ESCs with "
+            "--signals 'NAME.*'."
         )
     if form == BYTES and (has_start or has_end):
-        raise UserError("--from and --until are not for bin, which has no times")
+        raise UserError(
+            "--from, --until: cannot be used with bin, which has no times. Leave them out."
+        )
     if has_start and has_end and args.end < args.start:
-        raise UserError("--until is before --from")
+        raise UserError("--until: is before --from")
     target = Path(args.output)
     if not to_screen and target.exists() and not target.is_file() and form not in ON_SCREEN:
-        raise UserError(f"{target}: is no plain file, into which {form} cannot be written")
+        raise UserError(f"{target}: is not a regular file, which {form} needs. Give another name.")
 
 
 def _esc(args: argparse.Namespace, recording: Input) -> int:
     """Return the index of the ESC of --esc, or of the only one. Raises UserError if unclear."""
     names = [esc.name for esc in recording.bus.escs]
     if args.esc is None and len(names) > 1:
-        raise UserError(f"bin holds the bytes of one ESC. Give --esc: {', '.join(names)}")
+        raise UserError(f"bin: contains the bytes of only one ESC. Give --esc: {', '.join(names)}")
     if args.esc not in (None, *names):
-        raise UserError(f"--esc {args.esc}: there is no such ESC. There are: {', '.join(names)}")
+        raise UserError(f"--esc {args.esc}: no such ESC. Available: {', '.join(names)}")
     return names.index(args.esc) if args.esc else 0

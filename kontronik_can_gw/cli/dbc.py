@@ -48,7 +48,7 @@ EPILOG = (
 def main(args: argparse.Namespace) -> int:
     source = vars(args)["from"]
     if (source is not None or args.esc is not None) and args.config is not None:
-        raise UserError("--esc, --from: cannot be combined with --config, which says all that")
+        raise UserError("--esc, --from: cannot be combined with --config, which defines both")
     if source is not None and args.canopen:
         raise UserError("--from: cannot be combined with --canopen, which describes the nodes")
     if source is args.esc is args.config is None:
@@ -64,8 +64,8 @@ def main(args: argparse.Namespace) -> int:
     except UnicodeEncodeError:
         encoding = "utf-8"
         say(
-            "warning: written in UTF-8, because it has characters that Windows-1252, the usual "
-            "encoding of a DBC, has not"
+            "warning: written in UTF-8, because some characters do not exist in Windows-1252, the "
+            "usual encoding of a DBC"
         )
     inputs = configuration_files(args.config, source)
     write_output(args.output, text, inputs, force=args.force, encoding=encoding)
@@ -83,10 +83,7 @@ def _canopen(config: Path | None, escs: list[EscSettings]) -> str:
     nodes = setup.nodes(escs)
     waiting = waiting_for_lss(nodes, escs)
     if waiting:
-        say(
-            f"warning: {', '.join(waiting)}: no node-ID yet (LSS gives one), so no frames to "
-            "describe"
-        )
+        say(f"warning: {', '.join(waiting)}: left out, because LSS has not assigned a node-ID yet")
     return pdo_text(nodes, escs)
 
 
@@ -100,8 +97,8 @@ def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> s
         loaded = load_all(config)
         if loaded.database is None:
             raise UserError(
-                f"{config}: dbc.enabled is false: no messages of a DBC are sent. "
-                "--canopen writes those of the nodes."
+                f"{config}: dbc.enabled is false, so no messages of a DBC are sent. "
+                "For the frames of the nodes give --canopen."
             )
         plain = loaded.database
         layout = loaded.layout

@@ -12,8 +12,8 @@ OPTIONS = (
     *OUTPUT,
 )
 EPILOG = """\
-Decodes like kontronik-can-gw convert FILE - --to jsonl (or csv), but takes
-FILE for the bytes of one ESC. There is a row for each live frame, with all
+Decodes like kontronik-can-gw convert FILE - --to jsonl (or csv), but treats
+FILE as the bytes of one ESC. There is a row for each live frame, with all
 values. If no frame is found, a line describes the bytes. The bytes of a pipe
 are decoded as they arrive.
 

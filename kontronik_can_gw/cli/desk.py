@@ -40,7 +40,7 @@ def bus_layout(args: argparse.Namespace) -> BusLayout:
     loaded = load_all(args.config)
     if loaded.database is None:
         raise UserError(
-            f"{args.config}: dbc.enabled is false: no messages of a DBC are sent. "
+            f"{args.config}: dbc.enabled is false, so no messages of a DBC are sent. "
             "Give --dbc instead."
         )
     return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)

@@ -68,11 +68,8 @@ def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, name: str) 
             bitrate = node.settings.bitrate
             return dcf(setup.eds, node_id, bitrate, _active_values(node), esc.name, name)
     there = [str(node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
-    known = "All wait for LSS"
-    if there:
-        verb = "is" if len(there) == 1 else "are"
-        known = f"There {verb} {', '.join(there)}"
-    raise UserError(f"--node-id {node_id}: no node of the configuration has it. {known}.")
+    known = f"Available: {', '.join(there)}" if there else "All nodes wait for LSS"
+    raise UserError(f"--node-id {node_id}: not in the configuration. {known}.")
 
 
 def _active_values(node: Node) -> dict[tuple[int, int], Value]:

@@ -47,9 +47,9 @@ def main(args: argparse.Namespace) -> int:
     try:
         files = exported(bus.layout, bus.escs, silent_on_loss, licence)
     except NotInCore as error:
-        raise UserError(f"{bus.layout.file}: not in the core in C: {error}") from None
+        raise UserError(f"{bus.layout.file}: cannot be exported: {error}") from None
     if bus.config is not None and bus.config.canopen.enabled:
-        say("warning: CANopen nodes are not exported: only the messages of the DBC")
+        say("warning: CANopen nodes are not exported, only the messages of the DBC")
     try:
         inputs = configuration_files(args.config, args.dbc)
         _write(folder, files, inputs, force=args.force)
@@ -57,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
         raise RunError(
             f"{error.filename or folder}: cannot be written: {error.strerror}. Give another folder."
         ) from None
-    say(f"{folder} written. {folder / 'README.md'} says how to build it in.")
+    say(f"{folder} written. To build it into a firmware, see {folder / 'README.md'}.")
     return 0
 
 
@@ -66,7 +66,7 @@ def _write(folder: Path, files: dict[str, str], inputs: Sequence[Path], *, force
     own = folder / EXAMPLE
     is_kept = own.exists()
     if is_kept:
-        say(f"{own} exists and stays as it is")
+        say(f"{own} exists and is kept")
         del files[EXAMPLE]
     problems: list[str] = []
     for name in files:

@@ -25,7 +25,8 @@ def _loopback(text: str) -> tuple[str, int]:
     except ValueError:
         pass
     raise argparse.ArgumentTypeError(
-        f"{text!r} is no port on this machine, as 127.0.0.1:9123 or [::1]:9123"
+        f"{text!r} is not an address and port of this machine, for example 127.0.0.1:9123 or "
+        "[::1]:9123"
     )
 
 
@@ -45,7 +46,7 @@ OPTIONS = (
         default=("127.0.0.1", 9123),
     ),
 )
-EPILOG = "A gateway that does not run is answered with 503: Prometheus's up is 0."
+EPILOG = "If the gateway does not run, the answer is 503, and Prometheus's up is 0."
 
 
 def main(args: argparse.Namespace) -> int:

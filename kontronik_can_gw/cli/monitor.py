@@ -121,7 +121,7 @@ def _recording_of(args: argparse.Namespace) -> Path | None:
         args.channel = name or args.channel
         return None
     if args.interface is not None:
-        raise UserError(f"{name}: is played, so --interface means nothing. Leave it out.")
+        raise UserError(f"{name}: is a recording, so --interface has no effect. Leave it out.")
     return Path(name)
 
 
@@ -153,7 +153,7 @@ def _source_of(args: argparse.Namespace, recording: Path | None) -> Iterator[Sou
     with open_input(recording, given) as opened:
         if given is not None and isinstance(opened, CaptureInput):
             raise UserError(
-                f"{recording}: is a capture, which holds its own DBC. Leave -c and --dbc out."
+                f"{recording}: is a capture, which contains its own DBC. Leave -c and --dbc out."
             )
         if args.channel is not None:
             opened.select_channel(args.channel)

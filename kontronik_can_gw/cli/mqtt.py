@@ -73,10 +73,10 @@ def main(args: argparse.Namespace) -> int:
         raise missing_library("MQTT", "mqtt") from None
     if args.file is not None:
         raise UserError(
-            f"{args.file}: recordings are not published any more. "
+            f"{args.file}: recordings are no longer published. "
             f"Type kontronik-can-gw replay {args.file} --on can --channel vcan0 "
-            f"(a CAN log: canplayer -I {args.file} vcan0=can0), and beside it kontronik-can-gw "
-            "mqtt --channel vcan0 --broker HOST."
+            f"(for a CAN log: canplayer -I {args.file} vcan0=can0), and at the same time "
+            "kontronik-can-gw mqtt --channel vcan0 --broker HOST."
         )
     with logging_to_stderr():
         bus = bus_layout(args)
@@ -110,7 +110,7 @@ def _settings(broker: str | None, config: Config | None) -> MqttConfig:
         except ValueError as error:
             raise UserError(f"--broker: {error}") from None
     if table.broker is None:
-        raise UserError("no broker is given: --broker HOST, or mqtt.broker in the configuration")
+        raise UserError("no broker. Give --broker HOST, or mqtt.broker in the configuration.")
     folder = Path("" if config is None else config.file).parent
     problems = []
     files: dict[str, Any] = {}
@@ -120,7 +120,7 @@ def _settings(broker: str | None, config: Config | None) -> MqttConfig:
             continue
         files[name] = str(folder / file)
         if not getattr(table, needed):
-            problems.append(f"mqtt.{name}: means nothing without mqtt.{needed}")
+            problems.append(f"mqtt.{name}: has no effect without mqtt.{needed}")
     if problems:
         raise UserError(*problems)
     return replace(table, **files)

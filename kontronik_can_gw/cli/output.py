@@ -39,7 +39,7 @@ def check_output(output: str, inputs: Iterable[Path], *, force: bool) -> None:
             with suppress(OSError):
                 if written.samefile(path):
                     raise UserError(
-                        f"{output}: would write over the input {path}. Give another name."
+                        f"{output}: would overwrite the input {path}. Give another name."
                     )
     try:
         is_folder = target.is_dir()
@@ -92,9 +92,9 @@ def output_of(args: argparse.Namespace, name: str, default: str | None = None) -
     outputs = (args.output, getattr(args, name.lower()))
     given = [output for output in outputs if output is not None]
     if len(given) > 1:
-        raise UserError(f"{name} and -o: are two outputs. Give one of them.")
+        raise UserError(f"{name} and -o: both are outputs. Give only one.")
     if not given and default is None:
-        raise UserError(f"there is no output. Give {name}, or -o {name}.")
+        raise UserError(f"no output. Give {name}, or -o {name}.")
     return str(given[0]) if given else str(default)
 
 

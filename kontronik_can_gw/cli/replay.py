@@ -34,7 +34,7 @@ _MAX_BUSY_S = 5
 def _speed(text: str) -> float | None:
     if text == "max":
         return None
-    return number_from(0.01, 1000, "factor, and not max")(text)
+    return number_from(0.01, 1000, "factor (or max)")(text)
 
 
 OPTIONS = (
@@ -133,7 +133,7 @@ def main(args: argparse.Namespace) -> int:
     for place, names in _ONLY_FOR.items():
         given = [name for name in names if getattr(args, name)]
         if place != args.on and given:
-            raise UserError(f"--{given[0]} is for --on {place}")
+            raise UserError(f"--{given[0]}: is for --on {place}. Leave it out.")
     pace = Pace(args.speed)
     with reading(args.file, given_layout(args)) as recording:
         _play(args, recording, pace)
@@ -152,8 +152,8 @@ def _play(args: argparse.Namespace, recording: Input, pace: Pace) -> None:
         if not isinstance(recording, PlayedInput):
             raise UserError(
                 f"{name_of(args.file)}: is a log of CAN frames, which has no bytes of ESCs. "
-                "Type canplayer -I FILE (of can-utils) to send a candump log; "
-                "kontronik-can-gw convert makes one of other logs."
+                "To send a candump log, type canplayer -I FILE (of can-utils). "
+                "kontronik-can-gw convert makes a candump log of any other log."
             )
         play = {"can": _on_can, "pty": _on_pty}[args.on]
         text = play(args, recording, pace)
@@ -199,7 +199,7 @@ def _bus(args: argparse.Namespace, recording: PlayedInput, fd: bool) -> CanConfi
         return replace(can_config(recording.bus, args.interface, args.channel), fd=fd)
     if args.channel is None:
         raise UserError(
-            "--on can needs --channel, as vcan0, or a configuration (-c) that names one"
+            "--on can: no interface. Give --channel, for example vcan0, or a configuration (-c)."
         )
     return CanConfig(args.interface or "socketcan", args.channel, fd=fd)
 
@@ -222,13 +222,13 @@ def _send(port: CanPort, frame: CanFrame, channel: str, pace: Pace) -> None:
     since = time.monotonic()
     while (answer := port.send(frame)) is not Sent.OK:
         if answer in (Sent.DOWN, Sent.GONE):
-            raise RunError(f"CAN {channel}: went down, or away.")
+            raise RunError(f"CAN {channel}: is down or was removed.")
         if pace.stopped.is_set():
             return
         if time.monotonic() - since > _MAX_BUSY_S:
             raise RunError(
-                f"CAN {channel}: no frame can be sent for {_MAX_BUSY_S} s: "
-                "nobody acknowledges, or the bus is full."
+                f"CAN {channel}: no frame could be sent for {_MAX_BUSY_S} s. "
+                "No other node acknowledges, or the bus is full."
             )
         time.sleep(_BUSY_S)
 
@@ -256,5 +256,5 @@ def _on_pty(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str
             "which could take it for a command"
         )
     dropped = sum(terminal.dropped_bytes for terminal in opened)
-    lost = f", {dropped} of them dropped (nobody read)" if dropped else ""
+    lost = f", {dropped} of them dropped (not read)" if dropped else ""
     return f"{total} bytes to {len(names)} pseudo terminals{lost}"

@@ -70,7 +70,7 @@ def main(args: argparse.Namespace) -> int:
             _write_page(args, recording, inputs)
             return _STOPPED if was_ended(recording) else 0
     except KeyboardInterrupt:
-        say("stopped: nothing is written")
+        say("stopped: nothing was written")
         return _STOPPED
 
 
@@ -85,9 +85,9 @@ def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) 
     if not flight.rows:
         if was_ended(recording):
             raise KeyboardInterrupt
-        where = "in this part of it"
+        where = "between --from and --until"
         if not args.start and not args.end:
-            where = "by this DBC. Is -c or --dbc the right one?"
+            where = "according to this DBC. Is -c or --dbc the right one?"
         raise RunError(*damage, f"{source}: no values {where}")
     recording.begin_ns = flight.origin_ns
     details = {"Frames": recording.left_out, "Clock": "; ".join(recording.clock_notes)}
@@ -113,8 +113,7 @@ def _analysed(recording: Input, args: argparse.Namespace) -> Flight:
     flight = Flight(recording.bus.escs, fields, window=(args.start, args.end))
     if not flight.has_anything:
         raise UserError(
-            f"{recording.bus.layout.file}: has no signal that a report could show. "
-            "Give another --dbc."
+            f"{recording.bus.layout.file}: has no signal that a report shows. Give another --dbc."
         )
     blocks = filter(len, recording.blocks(chosen))
     for block in watched(blocks, f"{recording.name}: rows", args.output == "-"):

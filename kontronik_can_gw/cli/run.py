@@ -147,7 +147,7 @@ class _Run:
         # reported before the ports are opened, because a damaged file was already renamed
         for esc, reason in loaded.damaged:
             name = loaded.escs[esc].name
-            log.error("%s: stored parameters: %s. Running on defaults.", name, reason)
+            log.error("%s: stored parameters: %s. Using defaults.", name, reason)
         loop.open()
         log.info("%s", in_words(gateway.core.language, gateway.core_note))
         for esc, _ in loaded.damaged:
@@ -185,7 +185,7 @@ def _begin_realtime(priority: int | None, wait: bool) -> None:
     except RunError as error:
         if not wait:
             raise
-        log.error("%s Running without.", error)  # late frames are better than no frames
+        log.error("%s Running without it.", error)  # late frames are better than no frames
 
 
 def _parameter_store(folder: Path) -> "ParameterStore":

@@ -45,7 +45,7 @@ _OBSOLETE = (
 
 def _name(text: str) -> str:
     if text == "gateway" or not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,31}", text):
-        problem = f"{text!r} is no name: letters, digits, _ . -, and not gateway"
+        problem = f"{text!r} is not a name of letters, digits, _ . -, or it is gateway"
         raise argparse.ArgumentTypeError(problem)
     return text
 
@@ -104,11 +104,12 @@ def main(args: argparse.Namespace) -> int:
         raise UserError(f"{root}: is not a folder. --root names the top folder of a disk image.")
     if root is None and not _BOOTED.is_dir():
         raise RunError(
-            "this system does not run systemd. For a disk image: --root DIR. Without systemd: "
-            "run --wait"
+            "this system does not run systemd. For a disk image give --root DIR. "
+            "Without systemd, let your init start: kontronik-can-gw run --wait"
         )
     if root is None and os.geteuid() != 0:
-        raise RunError(f"only root may do that: sudo {_own_program()} service {args.action} ...")
+        command = f"sudo {_own_program()} service {args.action}"
+        raise RunError(f"service {args.action}: needs root. Type {command} with the same options.")
     try:
         if args.action == "install":
             _install(args, root or Path("/"))
@@ -155,7 +156,7 @@ def _install(args: argparse.Namespace, root: Path) -> None:
     for place in files:
         # some roots have absolute links, for example to /etc, which would change this machine
         if not (root / place).parent.resolve().is_relative_to(root.resolve()):
-            raise RunError(f"{(root / place).parent}: leads out of {root}")
+            raise RunError(f"{(root / place).parent}: is outside of {root}")
     for place, text in files.items():
         _put(root / place, text)
     for path in _obsolete_files(root):
@@ -172,7 +173,9 @@ def _install(args: argparse.Namespace, root: Path) -> None:
         link.symlink_to(f"/{UNITS}/{template}")
         lines = [f"{unit} is enabled. See: systemctl status {unit}"]
     else:
-        lines += [f"{unit} was not enabled. When it is right: sudo systemctl enable --now {unit}"]
+        lines.append(
+            f"{unit} was not enabled. After the correction: sudo systemctl enable --now {unit}"
+        )
     if args.root is None:
         _reload()
     if args.now and not is_ready:
@@ -191,9 +194,9 @@ def _put(path: Path, text: str) -> None:
         if path.is_file() and path.read_text(encoding="utf-8", errors="replace") == text:
             return
         kept = _set_aside(path)
-        done = f"replaced, the one before is {kept}"
+        done = f"replaced, the old file is {kept}"
         if path.suffix == ".rules":  # in 0.5.0 users wrote the names of ports into this file
-            done += f". Your lines are in {kept}: put them into 71-esc.rules"
+            done += f". Your lines are in {kept}. Move them to 71-esc.rules"
     path.write_text(text, encoding="utf-8")
     path.chmod(0o644)
     say(f"{path}: {done}")
@@ -228,7 +231,7 @@ def _not_ready(config: Path) -> list[str]:
         return list(error.problems)
     example_config = parse(tomllib.loads(example()), "")
     if ports & {esc.port for esc in example_config.esc}:
-        return [f"{config}: is the example. Set ports, bit rate and motors first."]
+        return [f"{config}: is the unchanged example. Set ports, bit rate and motors first."]
     return []
 
 
@@ -238,7 +241,7 @@ def _own_program() -> str:
     for folder in (scripts, Path(sys.argv[0]).absolute().parent):
         if os.access(folder / NAME, os.X_OK):
             return str(folder / NAME)
-    raise UserError(f"no installed {NAME} belongs to this Python. Name it with --executable.")
+    raise UserError(f"this Python has no installed {NAME}. Give its path with --executable.")
 
 
 def _check_program(program: str, *, is_own: bool) -> None:
@@ -255,8 +258,8 @@ def _check_program(program: str, *, is_own: bool) -> None:
             is_temporary = str(part) in ("/tmp", "/var/tmp")  # noqa: S108
             if is_temporary or not _is_accessible(part):
                 raise UserError(
-                    f"{path}: the service's user cannot reach it: {part}. "
-                    f"Install the program where all may read, as in /opt/{NAME}."
+                    f"{path}: the service's user cannot access {part}. "
+                    f"Install the program where all users may read, for example in /opt/{NAME}."
                 )
 
 
@@ -292,8 +295,8 @@ def _uninstall(root: Path, *, staged: bool) -> None:
         _call("systemctl", "daemon-reload")
     if found:
         say(
-            f"kept: /etc/{NAME}, /var/lib/{NAME}* (sudo rm -r), the user {NAME} (sudo userdel) "
-            "and /etc/systemd/network"
+            f"kept: /etc/{NAME}, /var/lib/{NAME}*, /run/{NAME}* (sudo rm -r), the user {NAME} "
+            "(sudo userdel) and /etc/systemd/network"
         )
     else:
         say("nothing is installed")

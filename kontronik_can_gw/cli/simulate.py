@@ -49,7 +49,9 @@ def _dropout(text: str) -> Dropout:
     duration, _, interval = text.partition("/")
     dropout = Dropout(_time_ns(duration), _time_ns(interval or "0"))
     if dropout.duration_ns >= dropout.interval_ns:
-        raise ArgumentTypeError(f"{text!r} is not a silence and a longer interval, as 2s/10s")
+        raise ArgumentTypeError(
+            f"{text!r} is not a length and a longer interval. Give for example 2s/10s"
+        )
     return dropout
 
 
@@ -96,7 +98,7 @@ OPTIONS = (
     option(
         "--flip-bits SHARE",
         "share of bits to flip, for example 0.0001",
-        type=number_from(0, 1, "share, as 0.0001"),
+        type=number_from(0, 1, "share"),
         default=0.0,
     ),
     option(
@@ -120,7 +122,7 @@ even an echo, this is an error (exit code 1), because a real ESC could take it
 for a command.
 
 TIME is 5s, 200ms, 2min or a number of seconds.
-Names of errors are the ones that decode prints, such as undervoltage or
+Names of errors are as printed by decode, for example undervoltage or
 test_short_to_ground.
 
 examples:
@@ -145,9 +147,11 @@ def main(args: argparse.Namespace) -> int:
                 f"{args.esc} ESCs."
             )
     if args.output is not None and args.seconds is None:
-        raise UserError(f"-o {args.output}: has no end. Give --seconds.")
+        raise UserError(f"-o {args.output}: would never end. Give --seconds.")
     if args.output is not None and args.link is not None:
-        raise UserError("--link: there is no pseudo terminal with -o. Give one of the two.")
+        raise UserError(
+            "--link: cannot be combined with -o, which opens no pseudo terminal. Give one of them."
+        )
     device = args.device or ("jivepro" if args.layout == "legacy" else "kosmik")
     options = EscOptions(
         device=_DEVICES[device],
@@ -213,9 +217,9 @@ def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | Non
         )
         for name, terminal in zip(names, opened, strict=True):
             lost = terminal.dropped_bytes
-            dropped = f", {lost} bytes dropped (nobody read)" if lost else ""
+            dropped = f", {lost} bytes dropped (not read)" if lost else ""
             counts = f"{terminal.frames} frames, {terminal.intact} of them intact{dropped}"
             print(f"{name}: {counts}", file=sys.stderr)
     if guilty:
-        remedy = "Nothing may ever be sent to an ESC: turn echo and writing off."
+        remedy = "Nothing may ever be sent to an ESC. Turn echo and writing off."
         raise RunError(*(f"{guilty[index]}. {remedy}" for index in sorted(guilty)))

@@ -154,7 +154,8 @@ class Housekeeping:
         """Log rejected parameters and what the outputs report, such as new states of nodes."""
         for index, key in self._gateway.take_rejected_parameters():
             log.warning(
-                "%s: the stored %04Xh:%02X is ignored: it does not fit this EDS, or clashes",
+                "%s: the stored value of %04Xh:%02X is ignored, because it does not fit this EDS "
+                "or conflicts with another value",
                 self._escs[index].name,
                 key >> 8,
                 key & 0xFF,
@@ -168,15 +169,15 @@ class Housekeeping:
         for conflict in self._gateway.conflicts.take():
             condition = f"CAN {self._can.config.channel}: {conflict.ids}"
             if conflict.over:
-                text = f"{condition}: nobody else sends with it"
+                text = f"{condition}: no other device uses it now"
                 self._conditions.end(condition, text, now, f"; {conflict.count} frames")
                 continue
             remedy = "Two nodes with one node-ID?"
             if conflict.node is None:
-                remedy = "Change one, as by dbc.base_id."
+                remedy = "Change one of the ids, for example with dbc.base_id."
             text = (
-                f"{condition}: somebody else sends with it too; "
-                f"here it is {conflict.whose}. {remedy}"
+                f"{condition}: another device sends with it, too. "
+                f"This gateway uses it for {conflict.whose}. {remedy}"
             )
             self._conditions.begin(condition, text, now)
 

@@ -136,7 +136,7 @@ class Loop:
             self._reason = f"ended ({error})"
             raise
         except BaseException as error:
-            self._reason = f"ended by a fault of the program ({error!r})"
+            self._reason = f"ended by an internal error ({error!r})"
             raise
         finally:
             self.end()

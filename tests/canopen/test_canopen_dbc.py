@@ -302,7 +302,7 @@ def test_a_node_that_waits_for_lss_has_no_frames_and_causes_a_warning(
     )
     assert main(["dbc", "--canopen", "-c", str(file)]) == 0
     text, said = capsys.readouterr()
-    assert "right_r: no node-ID yet (LSS gives one), so no frames to describe" in said
+    assert "right_r: left out, because LSS has not assigned a node-ID yet" in said
     db = read(text)
     assert {message.name[:4] for message in db.messages} == {"Left"}
     assert "No frames yet, because LSS must assign a node-ID: right_r." in str(db.buses[0].comment)

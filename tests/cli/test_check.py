@@ -57,7 +57,7 @@ def test_the_folders_configuration_is_preferred_to_the_machines(
     places: tuple[Path, Path], command: str
 ) -> None:
     own, machine = places
-    assert "Name the configuration: -c FILE" in refused(2, command)
+    assert "no configuration: neither " in refused(2, command)
     written(machine, "[[esc]]\nof_the_machine = 1\n")
     said = run(command)
     assert said.code == 2

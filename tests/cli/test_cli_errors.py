@@ -160,7 +160,7 @@ def test_a_missing_can_interface_is_reported_with_the_command_to_create_it(
     assert "CAN interface nocan7: " in said
     no_socketcan = "this kernel has no SocketCAN. Try: sudo modprobe -a can_raw vcan" in said
     assert no_socketcan or (
-        "there is none" in said and "ip link set nocan7 up type can bitrate 500000" in said
+        "does not exist" in said and "ip link set nocan7 up type can bitrate 500000" in said
     )
 
 

@@ -118,7 +118,7 @@ def test_an_input_is_never_overwritten(command: str, source: str, way: str, fold
     done = run(*command.format(o=output).split(), "--force")
     assert done.code == 2
     assert done.out == ""
-    assert f"{output}: would write over the input" in done.err
+    assert f"{output}: would overwrite the input" in done.err
     assert path.read_bytes() == before
 
 
@@ -134,13 +134,13 @@ def test_an_export_replaces_files_only_with_force_and_never_its_input(folder: Pa
     (folder / "fw" / "core.h").symlink_to(folder / "own.dbc")
     done = run("export", "c", "--dbc", "own.dbc", "fw", "--force")
     assert done.code == 2
-    assert "fw/core.h: would write over the input own.dbc" in done.err
+    assert "fw/core.h: would overwrite the input own.dbc" in done.err
     assert (folder / "own.dbc").read_text().startswith("VERSION")
 
 
 def test_two_outputs_are_refused_and_so_is_a_missing_output() -> None:
-    assert "OUT and -o: are two outputs" in run("convert", "x.bin", "a.csv", "-o", "b.csv").err
-    assert "there is no output. Give OUT, or -o OUT." in run("convert", "x.bin").err
+    assert "OUT and -o: both are outputs" in run("convert", "x.bin", "a.csv", "-o", "b.csv").err
+    assert "no output. Give OUT, or -o OUT." in run("convert", "x.bin").err
     assert run("init", "a", "-o", "b").code == run("export", "c").code == 2
 
 

@@ -323,6 +323,6 @@ def damaged(bench: Bench, injection: Injection, n: int) -> None:
     contents = (b"", content[: len(content) // 2], bytes(x ^ 0x20 for x in content))
     file.write_bytes(contents[n])
     start_and_wait(injection)
-    bench.wait_log("Running on defaults")
+    bench.wait_log("Using defaults")
     injection.wait_emergency(1, 0x6300)
     stores_again(bench)

@@ -133,7 +133,7 @@ def soak(
         if fault.bed is beds.two and not ends_process:
             faults.append(fault)
     row = report.of(SOAK)
-    bench.said_instead = "comes and goes"  # a flapping port does not cause a line each time
+    bench.said_instead = "happens often"  # a flapping port does not cause a line each time
     before = bench.gateway.figures()
     samples: list[Sample] = []
     while time.monotonic() < end:

@@ -341,7 +341,9 @@ def test_command_serves_the_configured_file_until_sigterm(
     text = '[[esc]]\nport = "/dev/ttyS0"\n[statistics]\nfile = '
     toml = written(tmp_path / "g.toml", f'{text}"own.json"\n')
     for text in ("0.0.0.0:9123", "10.0.0.1:1", "9123", "localhost:x", "[::]:1"):
-        assert "is no port on this machine" in refused(2, "metrics", toml, "--listen", text)
+        assert "is not an address and port of this machine" in refused(
+            2, "metrics", toml, "--listen", text
+        )
     said = refused(1, "metrics", "--file", file, "--listen", f"127.0.0.1:{port}")
     assert "cannot be listened to: Address already in use. Choose another" in said
     program = GatewayProcess(None, toml, "--listen", "127.0.0.1:0", command="metrics")

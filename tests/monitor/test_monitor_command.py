@@ -115,7 +115,7 @@ def test_a_capture_is_shown_with_its_own_dbc(tmp_path: Path, clock: Clock) -> No
     done = run("monitor", file, "--dbc", DBC)
     assert done.code == 2
     assert done.out == ""
-    assert "x.kcap: is a capture, which holds its own DBC. Leave -c and --dbc out." in done.err
+    assert "x.kcap: is a capture, which contains its own DBC. Leave -c and --dbc out." in done.err
 
 
 def test_plain_bytes_of_a_uart_are_shown(tmp_path: Path) -> None:

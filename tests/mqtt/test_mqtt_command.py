@@ -18,12 +18,12 @@ def configuration(folder: Path, mqtt: str) -> Path:
 @pytest.mark.parametrize(
     ("mqtt", "words", "code", "said"),
     [
-        ("", [], 2, "no broker is given: --broker HOST"),
+        ("", [], 2, "no broker. Give --broker HOST"),
         ("", ["--broker", "a b"], 2, "--broker: 'a b' is not a broker"),
         ("", ["flight.kcap"], 2, "Type kontronik-can-gw replay flight.kcap --on can"),
-        (HERE + "ca_file = 'x'\n", [], 2, "mqtt.ca_file: means nothing without mqtt.tls"),
+        (HERE + "ca_file = 'x'\n", [], 2, "mqtt.ca_file: has no effect without mqtt.tls"),
         (HERE + "password_file = 'x'\n", [], 2,
-         "mqtt.password_file: means nothing without mqtt.username"),
+         "mqtt.password_file: has no effect without mqtt.username"),
         (HERE + "username = 'x'\npassword_file = 'empty'\n", [], 2,
          "has no password on its first line"),
         (HERE + "tls = true\nca_file = 'empty'\n", [], 2,

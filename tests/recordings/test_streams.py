@@ -205,7 +205,7 @@ def test_a_signal_before_any_row_leaves_no_file(tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         code, messages = ended(process)
     assert code == 130
-    assert messages.endswith("stopped: nothing is written\n")
+    assert messages.endswith("stopped: nothing was written\n")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["whole.log"]
 
 
@@ -222,7 +222,7 @@ def test_an_interrupt_inside_exec_is_an_exit_code(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "interrupted", "convert", "in.kcap", "out.csv"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
     assert done.returncode == 130
-    assert done.stderr == b"kontronik-can-gw convert: stopped: nothing is written\n"
+    assert done.stderr == b"kontronik-can-gw convert: stopped: nothing was written\n"
 
 
 def _bytes_in(pipe: IO[bytes]) -> int:

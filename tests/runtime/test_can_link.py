@@ -329,7 +329,7 @@ def test_a_bus_that_was_stalled_gets_no_backlog(
     assert boot_ups_and_emergencies(sent) == ["7510"], "the loss of telemetry is reported again"
     said = [message for message in caplog.messages if "no frame can be sent" in message]
     assert said == [
-        "CAN can0: no frame can be sent: nobody acknowledges, or the bus is full. Trying again."
+        "CAN can0: no frame can be sent. No other node acknowledges, or the bus is full. Trying again."
     ]
     assert "CAN can0: frames are sent again, after 4.0 s" in caplog.messages
 
@@ -510,7 +510,11 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
         bench.turn(3000)
         assert not bench.can.is_open
     else:
+<<<<<<< HEAD
         with pytest.raises(RunError, match="is the port of left. Nothing may be sent to an ESC"):
+=======
+        with pytest.raises(RunError, match="is the port of left, and nothing may be sent"):
+>>>>>>> f3ad1b13 (runtime, cli: Say plainly what is wrong and what to do)
             bench.can.open(bench.now, wait=False)
     assert opened == []
 

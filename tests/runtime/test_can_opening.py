@@ -268,7 +268,7 @@ def test_a_driver_that_does_not_return_from_opening_is_logged(
     for seconds in (1000, 1001):
         it.loop._housekeeping.run(after + seconds * SECOND)
     (line,) = (line for line in it.loop.conditions.recent if "CAN" in line)
-    assert "CAN slcan /dev/none: still opening: the driver does not return." in line
+    assert "CAN slcan /dev/none: still opening, because the driver does not return." in line
     driver.error = error
     driver.may_open.set()
     it.turn_until(lambda: len([line for line in it.loop.conditions.recent if "CAN" in line]) > 1)

@@ -387,7 +387,7 @@ def test_an_interface_that_cannot_be_used_leaves_no_socket_open(
     (tmp_path / "can0" / "flags").write_text("0x1\n")
     opened.is_closed = False
     opened.bind_fault = errno.ENODEV
-    with pytest.raises(RunError, match="there is none"):
+    with pytest.raises(RunError, match="does not exist"):
         socketcan_port.open_socketcan(CanConfig())
     assert opened.is_closed
     opened.is_closed = False

@@ -44,10 +44,12 @@ def test_a_flapping_condition_is_logged_again_when_it_is_stable(
         conditions.end(NAME, "ok", now + SECOND)
         now += 2 * SECOND
         conditions.advance(now)
-    assert told.messages[-1].startswith("lost. This comes and goes")
+    assert told.messages[-1].startswith("lost. This happens often.")
     assert len(told.messages) == 2 * FLAPPING - 1
     conditions.advance(now + MINUTE)
-    assert told.messages[-1] == f"{NAME}: no longer comes and goes, 294 more times; it is over"
+    assert told.messages[-1] == (
+        f"{NAME}: happened 294 more times, but no longer often. It has ended."
+    )
     conditions.begin(NAME, "lost", now + MINUTE)
     assert told.messages[-1] == "lost"
 

@@ -881,5 +881,5 @@ def test_a_fault_of_the_program_is_logged_in_the_last_line(monkeypatch: pytest.M
     monkeypatch.setattr(loop, "turn", fail)
     with pytest.raises(ZeroDivisionError):
         loop.run()
-    expected = "ended by a fault of the program (ZeroDivisionError('x')) after"
+    expected = "ended by an internal error (ZeroDivisionError('x')) after"
     assert expected in loop.conditions.recent[-1]

@@ -109,7 +109,7 @@ def test_a_service_notifies_ready_and_alive_records_and_notifies_its_end(
     assert found_totals is not None, last
     assert min(map(int, found_totals.groups())) > 20
     if "not permitted" in logged:
-        assert "Running without." in logged
+        assert "Running without it." in logged
         assert policy == os.SCHED_OTHER
     else:
         assert policy == os.SCHED_FIFO

@@ -39,8 +39,8 @@ class Kernel:
         ("vcan0", "vcan", errno.ENETDOWN, "is down. Start it: sudo ip link set vcan0 up."),
         ("bus", "vcan", errno.ENETDOWN, "is down. Start it: sudo ip link set bus up."),
         ("far0", "vxcan", errno.ENETDOWN, "is down. Start it: sudo ip link set far0 up."),
-        ("vcan0", "", errno.ENODEV, f"there is none. Create it: {ADD}."),
-        ("can0", "", errno.ENODEV, f"With an adapter plugged in: {UP}."),
+        ("vcan0", "", errno.ENODEV, f"does not exist. Create it: {ADD}."),
+        ("can0", "", errno.ENODEV, f"If its adapter is plugged in: {UP}."),
     ],
 )
 def test_the_advice_of_run_and_monitor_fits_the_kind(

@@ -92,7 +92,7 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -
             gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
             sides.append(CanLink(loaded.config.can, gateway, Poller(), FaultLog()))
         sides[0].open(0, wait=True)
-        said = "CAN can0: (messages from 680h on|CANopen node 42|29-bit ids with 2Ah .*): another"
+        said = "CAN can0: (messages from 680h on|CANopen node 42|29-bit ids with 2Ah .*): used by another"
         with pytest.raises(RunError, match=said):
             sides[1].open(0, wait=True)
         sides[0].close()
@@ -125,7 +125,7 @@ def test_a_lock_that_cannot_be_taken_is_reported_once_and_not_needed(
     assert mine.hold(NODES[:1]) == mine.hold(NODES) == []
     mine.close()
     assert len(said) == 1
-    assert "Nothing keeps a second gateway" in said[0]
+    assert "A second gateway could use" in said[0]
     assert not (tmp_path / "other").exists()
 
 
@@ -188,6 +188,6 @@ def test_a_node_id_assigned_by_lss_that_another_gateway_has_is_logged(
     other = Locks()
     assert other.hold(NODES[:1]) == []
     assign_node_id(link, 5)
-    assert "can0: CANopen node 5: another gateway on this machine sends this." in caplog.text
+    assert "can0: CANopen node 5: used by another gateway on this machine." in caplog.text
     link.close()
     other.close()

@@ -133,7 +133,7 @@ def test_a_disk_that_does_not_answer_is_reported_once_until_it_does(
 
 @pytest.mark.parametrize(
     ("trouble", "said"),
-    [("no folder", "No such file"), ("no file", "no plain file"), ("full", "No space left")],
+    [("no folder", "No such file"), ("no file", "not a regular file"), ("full", "No space left")],
 )
 def test_a_file_that_cannot_be_written_is_reported_once_until_it_can(
     trouble: str,

@@ -173,7 +173,11 @@ def test_a_file_that_is_no_statistics_file_is_refused_in_one_line(tmp_path: Path
         file.write_bytes(content)
         assert refused(NOT_RUNNING, "status", "--file", file).startswith(f"{file}: is ")
     os.mkfifo(tmp_path / "pipe")
-    for name, said in (("none", "no such file"), (".", "no plain file"), ("pipe", "no plain file")):
+    for name, said in (
+        ("none", "no such file"),
+        (".", "not a regular file"),
+        ("pipe", "not a regular file"),
+    ):
         assert said in refused(NOT_RUNNING, "status", "--file", tmp_path / name)
 
 

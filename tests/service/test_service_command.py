@@ -55,8 +55,8 @@ def test_a_staged_install_writes_files_that_all_users_may_read(tmp_path: Path) -
     for kind, command in (("", "run --wait"), ("-metrics", "metrics"), ("-mqtt", "mqtt")):
         text = (tmp_path / UNITS / f"kontronik-can-gw{kind}.service").read_text()
         assert f"ExecStart={EXECUTABLE} {command} -c /etc/kontronik-can-gw/gateway.toml" in text
-    assert "is the example. Set ports, bit rate and motors first." in done.err
-    assert "kontronik-can-gw.service was not enabled. When it is right: " in done.err
+    assert "is the unchanged example. Set ports, bit rate and motors first." in done.err
+    assert "kontronik-can-gw.service was not enabled. After the correction: " in done.err
     (tmp_path / CONFIGURATION).write_text("[can]\nbitrat = 5\n")
     assert "can.bitrat: unknown key" in install(tmp_path).err
     assert install(tmp_path, "--now").code == 1
@@ -78,7 +78,7 @@ def test_an_edited_configuration_is_kept_and_changed_files_are_backed_up(tmp_pat
     for mine, kept in (("# mine\n", f"{rules.name}.bak"), ("# again\n", f"{rules.name}.bak2")):
         rules.write_text(before + mine)
         said = install(tmp_path).err
-        assert f"{rules}: replaced, the one before is {kept}. Your lines are in {kept}" in said
+        assert f"{rules}: replaced, the old file is {kept}. Your lines are in {kept}" in said
         assert rules.read_text() == before
         assert rules.with_name(kept).read_text() == before + mine
 
@@ -122,15 +122,15 @@ def test_a_link_out_of_the_root_is_not_followed(tmp_path: Path) -> None:
     done = install(tmp_path / "root")
     assert done.code == 1
     assert done.err.count("\n") == 1
-    assert "leads out of" in done.err
+    assert "is outside of" in done.err
     assert tree(tmp_path / "elsewhere") == []
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("install --instance ../x", "'../x' is no name"),
-        ("install --instance gateway", "'gateway' is no name"),
+        ("install --instance ../x", "'../x' is not a name"),
+        ("install --instance gateway", "'gateway' is not a name"),
         ("uninstall --instance left", "was removed. Type sudo systemctl disable --now kontronik"),
         ("status -n 3", "status: was removed. Type systemctl status"),
         ("uninstall --now", "unrecognized arguments: --now"),
@@ -152,7 +152,9 @@ def test_the_command_needs_systemd_and_root(
     monkeypatch.setattr(service, "_BOOTED", tmp_path)
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     said = refused(1, "service", action)
-    assert said.startswith(f"only root may do that: sudo {EXECUTABLE} service {action} ")
+    assert said.startswith(
+        f"service {action}: needs root. Type sudo {EXECUTABLE} service {action} "
+    )
 
 
 @pytest.mark.parametrize(
@@ -168,5 +170,5 @@ def test_a_program_that_a_unit_cannot_contain_is_refused(tmp_path: Path, program
 
 def test_a_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path) -> None:
     (tmp_path / "opt").mkdir(0o700)
-    with pytest.raises(UserError, match="the service's user cannot reach it: /"):
+    with pytest.raises(UserError, match="the service's user cannot access /"):
         service._check_program(f"{tmp_path}/opt/x", is_own=False)

@@ -98,7 +98,11 @@ def test_systemd_shows_the_expected_state(facts: Facts, place: str, expected: Fa
 @pytest.mark.parametrize(
     ("action", "code", "said"),
     [
-        ("install", 0, "gateway.toml: is the example. Set ports, bit rate and motors first."),
+        (
+            "install",
+            0,
+            "gateway.toml: is the unchanged example. Set ports, bit rate and motors first.",
+        ),
         ("install now", 0, "is enabled. See: systemctl status kontronik-can-gw.service\n"),
         ("install left", 0, "kontronik-can-gw@left.service is enabled."),
         ("install with faulty configuration", 1, "gateway.toml: esc[1].nonsense: unknown key."),

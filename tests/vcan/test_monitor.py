@@ -30,7 +30,7 @@ def test_a_monitor_reports_a_lost_interface_and_recovers(
             (
                 ("del", vcan),
                 [("add", vcan, "type", "vcan"), ("set", vcan, "up")],
-                "there is none.",
+                "does not exist.",
             ),
         ):
             before = len(out)

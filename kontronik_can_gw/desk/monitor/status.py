@@ -38,7 +38,7 @@ HEALTHY = 0
 TROUBLE = 1
 NOT_RUNNING = 3
 _LARGEST_FILE = 1 << 22
-FOREIGN = f"is not a statistics file of {PROGRAM}. Look at statistics.file."
+FOREIGN = f"is not a statistics file of {PROGRAM}. Check statistics.file."
 MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """Exceptions caused by a document whose values have unexpected types."""
 _WIDTH = 80
@@ -139,7 +139,7 @@ def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
         # the file may be replaced by a pipe at any time, on which a normal open would block
         with open(file, "rb", opener=_open_without_waiting) as opened:
             if not stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
-                text = "is no plain file. Look at statistics.file."
+                text = "is not a regular file. Check statistics.file."
                 return Seen(file, NOT_RUNNING, f"{file}: {text}")
             document = json.loads(opened.read(_LARGEST_FILE))
     except FileNotFoundError:
@@ -150,7 +150,7 @@ def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
             text = f"{config}: no gateway runs with this configuration. {start}"
         return Seen(file, NOT_RUNNING, text, is_missing=True)
     except IsADirectoryError:
-        text = "is no plain file. Look at statistics.file."
+        text = "is not a regular file. Check statistics.file."
     except OSError as error:
         text = f"cannot be read: {error.strerror}. Try it with sudo."
     except (ValueError, RecursionError):

@@ -22,8 +22,8 @@ RETRY_S = 0.5
 """Interval between attempts to open a faulty interface, and between checks of an open one."""
 _MAX_AT_ONCE = 4096
 _BUS_OFF = (
-    "CAN interface {name}: is bus-off: look at bit rate, wiring and termination. "
-    "Start it again: {command}"
+    "CAN interface {name}: is bus-off. Check bit rate, wiring and termination, then restart it: "
+    "{command}"
 )
 
 
@@ -115,7 +115,7 @@ class BusListener:
         self._port.overruns = 0
         if self._port.gone:
             self.close()
-            self.problem = f"CAN interface {self._config.channel}: went away. Trying again."
+            self.problem = f"CAN interface {self._config.channel}: was lost. Trying again."
         elif frames:
             self.problem = ""
             if self._port.state in (CanState.BUS_OFF, CanState.DOWN):

@@ -138,8 +138,8 @@ class CanController:
             self.ask(now)
         elif port.state is CanState.ERROR_PASSIVE:
             text = (
-                f"{name}: error-passive: wrong bit rate, a cable or termination fault, "
-                "or nobody acknowledges."
+                f"{name}: error-passive. The bit rate is wrong, a cable or the termination is faulty, "
+                "or no other node acknowledges."
             )
             self._conditions.begin(self.condition, text, now)
         elif port.state is not CanState.UNKNOWN:
@@ -176,7 +176,7 @@ class CanController:
         if bitrate == wanted:
             self._conditions.end(condition, text, now)
         else:
-            text = f"{text}, can.bitrate says {wanted}: make them the same."
+            text = f"{text}, but can.bitrate is {wanted}. Set both to the same bit rate."
             self._conditions.begin(condition, text, now)
 
     def _restart_hint(self) -> str:
@@ -184,6 +184,6 @@ class CanController:
             return ""
         name = self._config.channel
         return (
-            f" restart-ms is 0, so it stays off until somebody restarts it: {restart(name)}. "
+            f" restart-ms is 0, so it stays off until it is restarted: {restart(name)}. "
             f"To let it restart by itself: {restart(name, 'type can restart-ms 100')}."
         )

@@ -143,9 +143,9 @@ class CanLink:
         since = self._opening_since
         if since is not None and now - since >= SLOW_OPENING_NS:
             text = (
-                f"CAN {self.config.interface} {self.config.channel}: still opening: "
-                "the driver does not return. "
-                "Check the adapter; restart the gateway if it was replaced."
+                f"CAN {self.config.interface} {self.config.channel}: still opening, "
+                "because the driver does not return. "
+                "Check the adapter. If it was replaced, restart the gateway."
             )
             self._conditions.begin(self.opening_condition, text, now, since=since)
 

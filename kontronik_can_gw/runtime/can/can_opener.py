@@ -18,7 +18,9 @@ _AT_ONCE = ("socketcan", "virtual")
 """Interfaces that open without delay: SocketCAN, and python-can's bus within the process."""
 _END_S = 0.15
 """Longest time that ``close`` waits for a driver. The process must end within 0.3 s."""
-_NO_THREAD = "CAN {0.interface} {0.channel}: the system gives no thread to open it."
+_NO_THREAD = (
+    "CAN {0.interface} {0.channel}: cannot be opened, because the system cannot start a thread."
+)
 
 
 class CanOpener:
@@ -56,7 +58,8 @@ class CanOpener:
         esc = self._esc_at(config.channel)
         if esc is not None:
             raise RunError(
-                f"can.channel {config.channel} is the port of {esc}: nothing may be sent to an ESC."
+                f"can.channel: {config.channel} is the port of {esc}, and nothing may be sent to an "
+                "ESC. Name a CAN interface."
             )
         if self._is_at_once:
             try:

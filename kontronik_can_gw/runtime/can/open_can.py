@@ -48,13 +48,15 @@ def check_interface(config: CanConfig) -> None:
     """Raise UserError if python-can does not have the interface."""
     if config.interface == "socketcan":
         if config.options:
-            log.warning("can.options: SocketCAN takes none, they are ignored. Leave them out.")
+            log.warning("can.options: ignored, because SocketCAN has no options. Remove them.")
         return
     with without_asammdf():
         import can
     if config.interface not in can.VALID_INTERFACES:
         hint = did_you_mean(config.interface, sorted(can.VALID_INTERFACES), or_known=True)
-        raise UserError(f"can.interface: {config.interface!r} is no interface of python-can.{hint}")
+        raise UserError(
+            f"can.interface: {config.interface!r} is not an interface of python-can.{hint}"
+        )
 
 
 def open_can(config: CanConfig) -> CanPort:

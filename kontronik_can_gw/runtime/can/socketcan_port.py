@@ -264,7 +264,7 @@ def open_socketcan(config: CanConfig) -> SocketCanPort:
         command = enable_fd(config, kind_of(name))
         raise RunError(
             f"CAN interface {name}: CAN FD is not switched on. "
-            f"Switch it on: {command}; or set can.fd = false."
+            f"Switch it on: {command}. Otherwise set can.fd = false."
         )
     try:
         with contextlib.ExitStack() as undone:
@@ -296,11 +296,11 @@ def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
         kind = kind_of(name)
         virtual = add_virtual(config)
         if kind in VIRTUAL:
-            return RunError(f"CAN interface {name}: there is none. Create it: {virtual}.")
+            return RunError(f"CAN interface {name}: does not exist. Create it: {virtual}.")
         return RunError(
-            f"CAN interface {name}: there is none. "
-            f"With an adapter plugged in: {set_up(config, kind)}. "
-            f"For a virtual one: {virtual}."
+            f"CAN interface {name}: does not exist. "
+            f"If its adapter is plugged in: {set_up(config, kind)}. "
+            f"For a virtual interface: {virtual}."
         )
     if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
         return RunError(

@@ -141,7 +141,7 @@ class Transmitter:
         self.clear()
         self.is_stalled = True
         text = (
-            f"CAN {self._channel}: no frame can be sent: nobody acknowledges, "
+            f"CAN {self._channel}: no frame can be sent. No other node acknowledges, "
             "or the bus is full. Trying again."
         )
         self._conditions.begin(self.condition, text, now)

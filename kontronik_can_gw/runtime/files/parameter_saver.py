@@ -36,7 +36,7 @@ class ParameterSaver:
             if self._store is not None and self._store.save(name, content):
                 self._waiting += 1
             else:
-                self._take(index, "no store", now)
+                self._take(index, "there is no parameter store", now)
 
     def take_results(self, now: int, _events: int = 0) -> None:
         """Return the store's results to the nodes. Call it when they are readable."""

@@ -135,7 +135,7 @@ class Recorder:
                     "Give another folder (record.directory, --record)."
                 ) from None
         if not self._worker.start():
-            raise RunError("captures: the system gives no thread to write them")
+            raise RunError("captures: cannot be written, because the system cannot start a thread")
 
     def put(
         self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None
@@ -159,8 +159,8 @@ class Recorder:
         if self._overflowed >= max(1, 2 * self._reported_overflow):
             self._reported_overflow = self._overflowed
             text = (
-                f"captures: {self._overflowed} entries could not be recorded so far: "
-                "the disk is too slow"
+                f"captures: {self._overflowed} entries could not be recorded so far, "
+                "because the disk is too slow"
             )
             taken.append(Report("captures: losses", True, text))
         self.facts.lost = self._overflowed + self._unwritten
@@ -207,7 +207,7 @@ class Recorder:
         self.facts.bytes += file.sync()
         self.facts.file = str(file.path)
         if self.facts.problem:
-            self._note_problem("", f"{file.path} is written")
+            self._note_problem("", f"recording to {file.path}")
         is_old = now - file.begun >= self._config.part_minutes * 60 * SECOND
         if is_old or file.size >= self._config.part_mb * _MB:
             self._end_part()
@@ -227,13 +227,13 @@ class Recorder:
         self._is_usable = free_bytes >= minimum * _MB
         if not self._is_usable:
             self._end_part()
-            text = f"{self._folder}: less than {minimum} MB are free: nothing is recorded"
+            text = f"{self._folder}: less than {minimum} MB are free, so nothing is recorded"
             self._note_problem(text)
 
     def _make_folder(self) -> None:
         self._folder.mkdir(mode=0o750, parents=True, exist_ok=True)
         if not os.access(self._folder, os.W_OK | os.X_OK):
-            raise PermissionError(1, "may not be written to")
+            raise PermissionError(1, "the folder is not writable")
 
     def _append_remarks(self, items: list[Item], now: int) -> None:
         """Append entries about losses and the wall clock.
@@ -345,7 +345,7 @@ class CapturePart:
         Raises OSError if the file was removed.
         """
         if os.fstat(self._fd).st_nlink == 0:
-            raise OSError(errno.ENOENT, "what was being written was removed")
+            raise OSError(errno.ENOENT, "the file was removed while it was being written")
         if self._new:
             os.fdatasync(self._fd)
         new = self._new

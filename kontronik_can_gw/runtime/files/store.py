@@ -51,7 +51,7 @@ class ParameterStore:
         except Taken:
             raise RunError(
                 f"{path}: is in use by another gateway. "
-                "Give this one its own canopen.store, or its ESC another name."
+                "Give this gateway its own canopen.store, or rename its ESC."
             ) from None
         except OSError as error:
             return f"{path}: {reason_of(error)}"

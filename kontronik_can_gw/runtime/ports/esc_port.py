@@ -132,8 +132,8 @@ class EscPort:
             self._conditions.say(logging.INFO, text)
         if self._protocol.even_parity and is_mini_uart(port.path):
             text = (
-                f"{self.name}: {port.path} is a Raspberry Pi's mini-UART, which cannot do even "
-                "parity: frames may be lost or never come. Use ttyAMA0."
+                f"{self.name}: {port.path} is a Raspberry Pi's mini-UART, which does not support even "
+                "parity. Some or all frames may be lost. Use ttyAMA0."
             )
             self._conditions.say(logging.WARNING, text)
 
@@ -211,7 +211,7 @@ class EscPort:
             self._noted.restored = False
             text = (
                 f"{self.name}: another program changed the settings of {self.port.path}: "
-                f"set to {self._protocol.line} again"
+                f"restored to {self._protocol.line}"
             )
             self._conditions.event(f"{self.name}: settings", text, now)
         self.log.diagnose(self.line_errors, now)
@@ -251,7 +251,7 @@ class EscPort:
             if other is not None and find_adapter(other) == str(real_path):
                 raise RunError(
                     f"{self.path}: is another ESC's adapter now. "
-                    "Name ports by /dev/serial/by-id or by-path."
+                    "Use the names in /dev/serial/by-id or by-path for all ports."
                 )
         return self.path
 

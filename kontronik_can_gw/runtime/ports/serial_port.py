@@ -40,7 +40,7 @@ _LINE_ERRORS = {"framing": 6, "overrun": 7, "parity": 8, "break": 9, "buffer_ove
 """Positions of the counters in struct serial_icounter_struct (linux/serial.h)."""
 
 
-_NO_PARITY = "A Raspberry Pi's mini-UART (ttyS0) cannot do even parity: use ttyAMA0."
+_NO_PARITY = "For a Raspberry Pi's mini-UART (ttyS0), which has none, use ttyAMA0 instead."
 
 
 class PortLost(Exception):
@@ -181,7 +181,7 @@ def line_errors(fd: int) -> dict[str, int]:
 
 
 def is_mini_uart(path: str, root: Path = Path("/")) -> bool:
-    """Return True for a Raspberry Pi's mini-UART, which cannot do even parity."""
+    """Return True for a Raspberry Pi's mini-UART, which does not support even parity."""
     device = root / "sys/class/tty" / Path(os.path.realpath(path)).name / "device"
     with contextlib.suppress(OSError):
         for folder in [device.resolve(), *device.resolve().parents][:4]:
@@ -196,8 +196,8 @@ def _in_use(path: str, users: str) -> RunError:
     name = Path(os.path.realpath(path)).name
     getty = ""
     if name.startswith("tty"):
-        getty = f"; if it is a getty: sudo systemctl disable --now serial-getty@{name}"
-    return RunError(f"{path}: is in use by another program{who}. End it{getty}.")
+        getty = f" If it is a getty: sudo systemctl disable --now serial-getty@{name}."
+    return RunError(f"{path}: is in use by another program{who}. End it.{getty}")
 
 
 def device_of(path: str) -> int | None:
@@ -232,7 +232,7 @@ def _open_quietly(path: str) -> int:
     except termios.error:
         os.close(fd)
         raise RunError(
-            f"{path}: is not a serial port. Name the adapter's: see `ls /dev/serial/by-id`."
+            f"{path}: is not a serial port. See the adapters: `ls /dev/serial/by-id`."
         ) from None
     return fd
 
@@ -254,7 +254,7 @@ def _open(
             if is_pty:  # a pseudo terminal has no parity and may refuse it
                 return _open(path, protocol, is_pty, refuses_parity=True)
             raise RunError(
-                f"{path}: cannot do {protocol.baud_rate} baud with even parity. {_NO_PARITY}"
+                f"{path}: does not support {protocol.baud_rate} baud with even parity. {_NO_PARITY}"
             ) from None
         raise _explained(path, number, str(error)) from None
 
@@ -263,7 +263,7 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         ports = sorted(str(port) for port in Path("/dev/serial/by-id").glob("*"))
         if ports:
-            hint = f"Ports there are: {', '.join(ports)}."
+            hint = f"Available: {', '.join(ports)}."
         else:
             hint = "Is the adapter plugged in? See `ls /dev/serial/by-id`."
         return NoPort(f"{path}: no such serial port. {hint}")
@@ -276,7 +276,8 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
             group = grp.getgrgid(status.st_gid).gr_name
         if not is_shared:  # joining the group would not help
             return RunError(
-                f"{path}: permission denied, to its group {group} too: sudo chmod g+rw {path}."
+                f"{path}: permission denied, even for its group {group}. "
+                f"Permit it: sudo chmod g+rw {path}."
             )
         return RunError(
             f"{path}: permission denied. "
@@ -284,9 +285,9 @@ def _explained(path: str, number: int | None, text: str) -> RunError:
         )
     if number == errno.EPERM:
         return RunError(
-            f"{path}: the service is not allowed to use this device: "
-            "sudo systemctl edit kontronik-can-gw, and there under "
-            f"[Service]: DeviceAllow={path} rw."
+            f"{path}: the service is not allowed to use this device. "
+            "Type sudo systemctl edit kontronik-can-gw, and add under [Service]: "
+            f"DeviceAllow={path} rw."
         )
     if number in (errno.EAGAIN, errno.EBUSY):
         return _in_use(path, _users(path))
@@ -326,7 +327,7 @@ def _users(path: str) -> str:
         lines = Path("/proc/consoles").read_text().splitlines()
         if any(line.split()[:1] == [name] for line in lines):
             found.add(
-                f"the kernel's console (take console={name} out of the kernel's command line)"
+                f"the kernel's console (remove console={name} from the kernel's command line)"
             )
     seen = [process for process in _seen_users if _has_open(process, device)]
     # All programs are searched only if the earlier users have closed the port.

@@ -108,14 +108,16 @@ class Statistics:
         self._locks = Locks()
         if self._locks.hold([_lock_name(file)]):
             raise RunError(
-                f"statistics.file {file}: another gateway writes it. Give this one its own."
+                f"statistics.file {file}: another gateway writes it. Give each gateway its own file."
             )
         self._worker: Worker[None] = Worker(
             "statistics", self._work, failed=self._fail, ended=self._end, capacity=1
         )
         self._faults = self._worker.faults
         if not self._worker.start():
-            raise RunError("statistics: cannot be begun: no thread can be started")
+            raise RunError(
+                "statistics: cannot be written, because the system cannot start a thread"
+            )
 
     def publish(self, moment: Moment) -> None:
         """Let the thread write a document from this data. Never blocks."""
@@ -140,7 +142,7 @@ class Statistics:
             return
         self._written = moment
         self._write(f"{snapshot(moment, before)}\n".encode("utf-8", "replace"))
-        self._faults.note("statistics", False, "the statistics work again")
+        self._faults.note("statistics", False, "statistics: written again")
 
     def _write(self, data: bytes) -> None:
         """Replace the file, so that a reader always finds the whole old or new content.
@@ -153,7 +155,7 @@ class Statistics:
         try:
             # os.path and os.replace are cheaper than pathlib, and this runs every second.
             if not os.path.isfile(path) and path.exists():  # noqa: PTH113
-                raise OSError(errno.EINVAL, "what is there is no plain file")  # e.g. /dev/null
+                raise OSError(errno.EINVAL, "it is not a regular file")  # e.g. /dev/null
             write_new(temporary, data, 0o644)
             os.replace(temporary, path)  # noqa: PTH105
         except OSError as error:
@@ -181,7 +183,9 @@ class Statistics:
 
     def _fail(self, error: Exception) -> None:
         """Report a bug in the making of the document."""
-        self._faults.note("statistics", True, f"the statistics fail: {error!r}. Trying again.")
+        self._faults.note(
+            "statistics", True, f"statistics: internal error {error!r}. Trying again."
+        )
 
     def _end(self) -> None:
         if not self._is_ours:

@@ -81,7 +81,7 @@ class FaultLog:
             condition.flaps = True
             text = (
                 f"{text.removesuffix('.')}. "
-                "This comes and goes: the next line is when it has not begun for a minute."
+                "This happens often. The next line appears after a minute without it."
             )
         self.say(level, text)
 
@@ -123,8 +123,10 @@ class FaultLog:
         for name, condition in self._known.items():
             if condition.flaps and now - condition.begins[-1] >= MINUTE:
                 lasts = condition.begun is not None
-                state = f"it lasts: {condition.reason}" if lasts else "it is over"
-                text = f"{name}: no longer comes and goes, {condition.count} more times; {state}"
+                state = f"It still lasts: {condition.reason}" if lasts else "It has ended."
+                text = (
+                    f"{name}: happened {condition.count} more times, but no longer often. {state}"
+                )
                 self.say(logging.INFO, text)
                 condition.flaps = False
                 condition.count = 0

@@ -109,7 +109,7 @@ class Locks:
         except OSError as error:
             text = (
                 f"{folder}: {reason_of(error)}. "
-                "Nothing keeps a second gateway from the same node-IDs and messages."
+                "A second gateway could use the same node-IDs and messages."
             )
             if text not in self._reported:
                 self._reported.add(text)
@@ -138,8 +138,8 @@ def names_of(gateway: Gateway, channel: str) -> list[str]:
 def in_use(name: str) -> RunError:
     """Return the error for a lock that another gateway holds."""
     return RunError(
-        f"CAN {name}: another gateway on this machine sends this. "
-        "End it, or change node-ID or dbc.base_id."
+        f"CAN {name}: used by another gateway on this machine. "
+        "End that gateway, or change node-ID or dbc.base_id."
     )
 
 

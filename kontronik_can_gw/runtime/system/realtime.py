@@ -33,12 +33,11 @@ def begin(priority: int) -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
         raise RunError(
-            f"run.realtime_priority = {priority}: not permitted. "
-            f"{_how(priority)}, then start again."
+            f"run.realtime_priority = {priority}: not permitted. {_how(priority)}, and start again."
         ) from None
     except OSError as error:
         raise RunError(
-            f"run.realtime_priority = {priority}: {error.strerror or error}. Leave it out."
+            f"run.realtime_priority = {priority}: {error.strerror or error}. Remove it."
         ) from None
     _Taken.priority = priority
     for thread in threading.enumerate():
@@ -59,10 +58,10 @@ def follow(thread: threading.Thread) -> None:
 def _how(priority: int) -> str:
     if "INVOCATION_ID" in os.environ:  # systemd
         return (
-            "sudo systemctl edit kontronik-can-gw, and there under [Service]: RestrictRealtime=no, "
-            f"LimitRTPRIO={priority} and LimitMEMLOCK=infinity, each on a line"
+            "Type sudo systemctl edit kontronik-can-gw, add below [Service] the lines "
+            f"RestrictRealtime=no, LimitRTPRIO={priority} and LimitMEMLOCK=infinity"
         )
-    return f"Once, for this shell: sudo prlimit --rtprio={priority} --memlock=unlimited --pid $$"
+    return f"Type sudo prlimit --rtprio={priority} --memlock=unlimited --pid $$ in this shell"
 
 
 def _lock_memory() -> None:

@@ -204,7 +204,7 @@ class Worker(Generic[Item]):
         since = self.busy_since
         is_slow = since is not None and now - since > slow_ns
         if is_slow or since is None:
-            text = "does not answer; the gateway is not held up." if is_slow else "answers again"
+            text = "does not answer. The gateway keeps running." if is_slow else "answers again"
             self.faults.note(f"{target}: disk", is_slow, f"{target}: the disk {text}")
         return self.faults.take()
 
