@@ -126,8 +126,10 @@ class _Run:
         wait = self._args.wait or config.run.wait_for_devices
         _begin_realtime(config.run.realtime_priority, wait)
         gateway, recorder = self._gateway(loaded)
+        # They are logged after the start. If the start fails, its error is more important.
+        warnings: list[str] = []
         try:
-            statistics = open_statistics(config.statistics_path, path)
+            statistics = open_statistics(config.statistics_path, path, warnings.append)
         except UserError:
             if loaded.store is not None:
                 loaded.store.close(0)
@@ -149,6 +151,8 @@ class _Run:
             name = loaded.escs[esc].name
             log.error("%s: stored parameters: %s. Using defaults.", name, reason)
         loop.open()
+        for warning in warnings:
+            log.warning("%s", warning)
         log.info("%s", in_words(gateway.core.language, gateway.core_note))
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())

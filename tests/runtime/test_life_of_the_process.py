@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 from vcan_tools import feeding
 
+from kontronik_can_gw.cli import main
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.runtime.status.statistics import open_statistics
 
@@ -236,12 +237,27 @@ def test_status_finds_gateways_run_by_hand_until_they_end(tmp_path: Path) -> Non
 def test_a_second_gateway_with_the_same_configuration_has_no_status(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    first = open_statistics(None, tmp_path / "gateway.toml")
+    warnings: list[str] = []
+    first = open_statistics(None, tmp_path / "gateway.toml", warnings.append)
     assert first is not None
-    assert open_statistics(None, tmp_path / "gateway.toml") is None
-    assert "`kontronik-can-gw status` cannot show this gateway: " in caplog.text
-    assert "another gateway writes it" in caplog.text
+    assert open_statistics(None, tmp_path / "gateway.toml", warnings.append) is None
+    (warning,) = warnings
+    assert "`kontronik-can-gw status` cannot show this gateway: " in warning
+    assert "another gateway writes it" in warning
+    first.close()
+
+
+def test_a_gateway_that_cannot_start_reports_only_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    file = tmp_path / "gateway.toml"
+    file.write_text('[can]\nchannel = "nocan7"\n[[esc]]\nport = "/dev/none"\npole_pairs = 7\n')
+    first = open_statistics(None, file, lambda _: None)
+    assert first is not None
+    assert main(["run", "-c", str(file)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "/dev/none: no such serial port" in line
     first.close()

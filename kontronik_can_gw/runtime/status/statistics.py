@@ -7,9 +7,9 @@ assignment. So neither the disk nor the making of the document delays the loop.
 
 import contextlib
 import errno
-import logging
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
@@ -20,19 +20,19 @@ from kontronik_can_gw.runtime.system.locks import Locks
 from kontronik_can_gw.runtime.system.worker import Report, Worker
 from kontronik_can_gw.times import SECOND
 
-log = logging.getLogger("kontronik_can_gw")
-
 PERIOD_NS = SECOND
 _CLOSE_S = 0.2
 
 
-def open_statistics(configured: Path | None, configuration: Path) -> "Statistics | None":
+def open_statistics(
+    configured: Path | None, configuration: Path, warn: Callable[[str], object]
+) -> "Statistics | None":
     """Start to publish the status of the gateway with this configuration.
 
     ``configured`` is the file of ``statistics.file``, or None. The status is written to that file.
     It can also be found in the runtime folder, in which ``kontronik-can-gw status`` searches for
-    gateways. Without ``statistics.file``, a failure is logged and None is returned. Raises RunError
-    if another gateway writes the configured file.
+    gateways. If that fails, ``warn`` gets the reason, and None is returned if there is no
+    ``statistics.file`` either. Raises RunError if another gateway writes the configured file.
     """
     published: Path | None = None
     problem = ""
@@ -45,7 +45,7 @@ def open_statistics(configured: Path | None, configuration: Path) -> "Statistics
     except OSError as error:
         problem = reason_of(error)
     if problem:
-        log.warning("`kontronik-can-gw status` cannot show this gateway: %s", problem)
+        warn(f"`kontronik-can-gw status` cannot show this gateway: {problem}")
     return None if configured is None else Statistics(configured, link=published)
 
 
