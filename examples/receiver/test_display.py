@@ -1,4 +1,4 @@
-"""A display against a real gateway: telemetry, an ESC that goes and comes back, error bits, a bus that goes down."""
+"""Tests of a display with a real gateway: telemetry, a lost ESC, error bits, a failed interface."""
 
 from conftest import Bench, until
 from display import Display
