@@ -192,7 +192,7 @@ class Member:
                 found.append(bit)
         for position in range(32):
             if number >> position & 1 and position not in bits:
-                meaning = f"bit {position} of {word}, which has no name"
+                meaning = f"bit {position} of {word}, without a name"
                 found.append(Flag(f"bit{position}", Severity.WARNING, meaning))
         if not found and not has_other_values:
             return None

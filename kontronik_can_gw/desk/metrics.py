@@ -245,5 +245,5 @@ def server_of(
         return make_server(host, port, answer, Server, _Handler)
     except OSError as error:
         where = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        reason = f"cannot be listened to: {error.strerror}. Choose another address or port."
+        reason = f"cannot be used: {error.strerror}. Choose another address or port."
         raise RunError(f"--listen {where}: {reason}") from None

@@ -181,6 +181,6 @@ def _make_link(link: Path, target: str) -> Path:
         link.symlink_to(target)
     except OSError as error:
         raise RunError(
-            f"{link}: no link can be made: {error.strerror}. Give another --link."
+            f"{link}: the link cannot be created: {error.strerror}. Give another --link."
         ) from None
     return link

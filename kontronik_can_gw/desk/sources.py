@@ -107,7 +107,7 @@ class Bus(Source):
         self.hints = (
             "Is the gateway running (kontronik-can-gw status)?",
             f"Is the bit rate right ({rate})?",
-            "Does the gateway send by another DBC (give -c or --dbc)?",
+            "Does the gateway use another DBC (give -c or --dbc)?",
         )
 
     def pump(self, take: Take, until_s: float) -> None:

@@ -349,7 +349,7 @@ def test_a_later_part_without_a_number_is_damage(
         path.write_bytes(block(b"H", 0, json_payload(document)) + data)
     with open_input(tmp_path) as found:
         list(found.frames())
-        assert any("has a part that is no number" in line for line in found.damage)
+        assert any("has a part number that is not an integer" in line for line in found.damage)
 
 
 def test_wrong_entries_cause_only_our_own_errors(
@@ -414,7 +414,7 @@ def test_damage_of_a_completely_damaged_file_is_summed_up(
     with open_input(path) as found:
         assert list(found.frames()) == []
         assert len(found.damage) < 60
-        assert "and more of that kind" in found.damage
+        assert "and further damage" in found.damage
 
 
 def test_a_header_cannot_forge_lines(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:

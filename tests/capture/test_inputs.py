@@ -90,7 +90,7 @@ def test_a_run_is_selected_by_its_folder_or_the_beginning_of_its_name(tmp_path: 
     bench = plain_run(1)
     with pytest.raises(UserError, match="has no captures"):
         open_input(tmp_path)
-    with pytest.raises(UserError, match="no such file"):
+    with pytest.raises(UserError, match="does not exist"):
         open_input(tmp_path / "nothing")
     capture(tmp_path / "20260101T000000Z-aaaaaa-0000.kcap", bench.setup, bench.entries)
     capture(tmp_path / "20260102T000000Z-bbbbbb-0000.kcap", bench.setup, bench.entries, run="b")
@@ -117,7 +117,7 @@ def test_a_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: P
     capture(tmp_path / "20260101T000000Z-aaaaaa-00001.kcap", bench.setup, bench.entries, part=1)
     with open_input(tmp_path) as found:
         assert len(list(found.samples())) > 50
-        expected = "20260101T000000Z-aaaaaa-00000.kcap: has no header that could be read"
+        expected = "20260101T000000Z-aaaaaa-00000.kcap: left out, because it has no readable header"
         assert expected in found.damage
 
 
@@ -183,6 +183,6 @@ def test_missing_blocks_and_a_missing_end_of_a_capture_are_reported(tmp_path: Pa
     assert times == [3 * SECOND, 3 * SECOND, 7 * SECOND]
     place = sum(map(len, blocks[:3]))
     assert damage == [
-        f"a.kcap: 2 blocks in front of byte {place} are missing",
-        "a.kcap: was not closed: up to the last second before its end may be missing",
+        f"a.kcap: 2 blocks before byte {place} are missing",
+        "a.kcap: was not closed, so up to a second may be missing at its end",
     ]

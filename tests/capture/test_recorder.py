@@ -134,7 +134,7 @@ def test_all_parts_of_a_run_together_replay_the_run(tmp_path: Path) -> None:
             assert found.damage == []
         assert frames == bench.sent
     files[1].unlink()
-    recorded(tmp_path, "1 parts of the run in front of it are not given")
+    recorded(tmp_path, "1 earlier parts of the run are not given")
 
 
 def test_a_new_part_begins_after_the_configured_time(tmp_path: Path) -> None:

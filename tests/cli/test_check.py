@@ -162,7 +162,7 @@ def test_toml_beyond_the_limits_of_python_is_explained_to_users(text: str, tmp_p
     ("content", "said"),
     [
         (None, "the password cannot be read: No such file or directory"),
-        (b"\xff", "the password is no text in UTF-8"),
+        (b"\xff", "the password is not UTF-8 text"),
     ],
 )
 def test_a_bad_password_file_is_explained_to_users(

@@ -48,7 +48,7 @@ def terminal() -> Iterator[PtyEsc]:
 def test_a_removed_option_is_refused_with_its_replacement(words: str) -> None:
     assert refused(2, *words.split()).startswith("--to: was removed. Type --on can or --on pty. ")
     assert "unrecognized arguments: --to" in refused(2, "schema", "--to")
-    assert "there is no such file" in refused(2, "decode", "--", "--stats")
+    assert "does not exist" in refused(2, "decode", "--", "--stats")
 
 
 @pytest.mark.parametrize("words", ["describe --form json", "service install --root . --chan can1"])

@@ -73,7 +73,7 @@ def test_a_usable_setup_has_exit_code_0_and_plain_text_in_a_pipe(
         ('[record]\ndirectory = "afile/x"', "", 1, ["config.folder"], "is a file, not a folder"),
         (
             '[record]\ndirectory = "captures"\nmin_free_mb = 10000000', "", 1, ["config.folder"],
-            "nothing is written with less than 10000000 MB",
+            "but at least 10000000 MB are needed",
         ),
     ],
 )  # fmt: skip
@@ -100,7 +100,7 @@ def test_doctor_creates_and_changes_nothing(tmp_path: Path, esc: PtyEsc) -> None
     record = '[record]\ndirectory = "captures"\nmin_free_mb = 0'
     more = canopen + record
     findings, _ = document(configuration(tmp_path, esc.path, more), 0)
-    assert sum(f["text"].endswith(", will be made") for f in findings) == 2
+    assert sum(f["text"].endswith(", will be created") for f in findings) == 2
     assert [p.name for p in tmp_path.iterdir()] == ["gateway.toml"]
 
 

@@ -81,7 +81,7 @@ def test_without_systemd_an_installation_is_not_advised(tree: Tree, folder: str)
         (STORE, (True, 1 << 30), "open", ERROR, "read-only"),
         (STORE, (False, 1000), "open", ERROR, "full"),
         (STORE, (False, 1 << 21), "open", OK, ""),
-        ("/var/lib", ROOM, "open", OK, f"{STORE}, will be made"),
+        ("/var/lib", ROOM, "open", OK, f"{STORE}, will be created"),
         ("/var/lib", ROOM, "closed", ERROR, f"chown anna {STORE}"),
         ("/var/lib", ROOM, "of systemd", OK, "made by systemd"),
         ("/var/lib", ROOM, "of a gateway", NOTE, "perhaps the running gateway may"),

@@ -182,7 +182,7 @@ def _run(line: str, folder: Path, shown: _Shown) -> Iterator[str]:
     code = 0
     if words[0] == "cat":
         if not (folder / words[1]).is_file():
-            yield "! there is no such file"
+            yield "! does not exist"
             return
         out.buffer.write((folder / words[1]).read_bytes())
     else:

@@ -345,7 +345,7 @@ def test_command_serves_the_configured_file_until_sigterm(
             2, "metrics", toml, "--listen", text
         )
     said = refused(1, "metrics", "--file", file, "--listen", f"127.0.0.1:{port}")
-    assert "cannot be listened to: Address already in use. Choose another" in said
+    assert "cannot be used: Address already in use. Choose another" in said
     program = GatewayProcess(None, toml, "--listen", "127.0.0.1:0", command="metrics")
     try:
         program.wait_for_line(f"serves {tmp_path}/own.json")

@@ -121,7 +121,7 @@ def test_can_fd_frames_are_left_out_of_trc_with_a_warning(tmp_path: Path) -> Non
     write_log(source, "candump", some)
     said = run("convert", source, tmp_path / "fd.trc").err
     wide = sum(frame.fd for _, frame, _ in some)
-    assert f"{wide} CAN FD frames left out, which trc does not know" in said
+    assert f"{wide} CAN FD frames left out, which trc does not support" in said
     found = [item[1:] for item in read_log(tmp_path / "fd.trc")[0]]
     assert found == [item[1:] for item in some if not item[1].fd]
 

@@ -64,7 +64,9 @@ def test_a_channel_is_chosen_by_its_name_in_the_log(tmp_path: Path, format_: str
         ("monitor", "--once", log),
     ):
         assert refused(2, *words) == ambiguous
-        assert refused(2, *words, "--channel", "7") == f"{log}: has no channel 7. It has: {listed}."
+        assert (
+            refused(2, *words, "--channel", "7") == f"{log}: has no channel 7. Available: {listed}."
+        )
     assert not (tmp_path / "other.csv").exists()
     assert not page.exists()
     assert run("report", log, "-o", page, "--channel", names[1]).code == 0
@@ -102,7 +104,7 @@ def test_the_only_channel_with_messages_of_the_dbc_is_chosen(tmp_path: Path) -> 
     log.write_text(log.read_text().replace("can1 688", "can1 123"))
     assert _voltages(log) == {"25.0"}
     done = run("convert", log, tmp_path / "other.csv")
-    assert f"{log}: 50 CAN frames left out that kontronik_esc.dbc does not have" in done.err
+    assert f"{log}: 50 CAN frames left out that are not in kontronik_esc.dbc" in done.err
     done = run("convert", log, tmp_path / "other.csv", "--channel", "can0", "--force")
     assert "left out" not in done.err
 
@@ -119,7 +121,7 @@ def test_a_capture_has_no_channels(tmp_path: Path) -> None:
     path = tmp_path / "a.kcap"
     path.write_bytes(capture_file(bench.setup, bench.entries))
     said = refused(2, "convert", path, tmp_path / "o.csv", "--channel", "can0")
-    assert said == f"{path}: is no CAN log, so --channel can0 means nothing. Leave it out."
+    assert said == f"{path}: is not a CAN log, so --channel can0 has no effect. Leave it out."
 
 
 @pytest.mark.parametrize(

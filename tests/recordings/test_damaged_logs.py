@@ -165,7 +165,7 @@ def test_a_container_of_an_impossible_size_is_reported_as_damage(tmp_path: Path,
     found, damage = read_log(path)
     assert found == items[: len(found)]
     assert 1000 < len(found) < len(items)
-    assert damage[0] == f"a container of {size} bytes at byte 144"
+    assert damage[0] == f"the container at byte 144 has the impossible size {size}"
 
 
 TRC = ";$FILEVERSION={}\n;$STARTTIME=45244.0\n;$COLUMNS=N,O,T,I,d,L,D\n{}\n"
@@ -192,7 +192,7 @@ def test_a_trc_line_with_an_impossible_time_or_length_is_damaged(tmp_path: Path,
 
 
 @pytest.mark.parametrize(
-    ("version", "count", "damage"), [("1.0", 2, []), ("1.2", 0, ["its file version is not known"])]
+    ("version", "count", "damage"), [("1.0", 2, []), ("1.2", 0, ["its file version is unknown"])]
 )
 def test_trc_of_version_1_0_is_read_if_its_header_names_the_version(
     tmp_path: Path,

@@ -90,7 +90,7 @@ def test_tables_reports_and_screens_count_error_and_remote_frames(tmp_path: Path
     done = run("monitor", "--once", log)
     assert "warning: 1 error frame and 2 remote frames left out" in done.err
     done = run("convert", log, tmp_path / "copy.trc")
-    assert "; 1 error frame left out, which trc does not know" in done.err
+    assert "; 1 error frame left out, which trc does not support" in done.err
     done = run("convert", log, tmp_path / "copy.log")
     assert "left out" not in done.err
     copied = (tmp_path / "copy.log").read_text().splitlines()

@@ -20,7 +20,7 @@ def test_frames_missing_in_the_dbc_are_counted_and_a_remedy_is_named(
         ("monitor", "--once", log),
     ):
         said = run(*words).err
-        left_out = "frames left out that kontronik_esc.dbc does not have (-c or --dbc gives"
+        left_out = "frames left out that are not in kontronik_esc.dbc (for another DBC give -c"
         assert left_out in said, words
     assert "left out" not in run("convert", log, tmp_path / "o.blf").err, "which holds all of them"
 
@@ -32,7 +32,7 @@ def test_a_table_in_mf4_is_distinguished_from_a_log(tmp_path: Path) -> None:
         mdf.append(asammdf.Signal(values, timestamps=values, name="BatteryVoltage"))
         mdf.save(table)
     said = refused(2, "convert", table, tmp_path / "o.csv")
-    assert "table.mf4: is a table of values (an MF4 measurement), no log of a CAN bus." in said
+    assert "table.mf4: is a table of values (an MF4 measurement), not a log of a CAN bus." in said
 
 
 @pytest.mark.parametrize(
@@ -78,4 +78,4 @@ def test_decode_refuses_files_that_are_not_the_bytes_of_an_esc(tmp_path: Path) -
     for command in (["convert"], ["decode", "--csv"]):
         missing = tmp_path / "none"
         said = refused(2, *command, missing, "-o", tmp_path / "o.csv")
-        assert said == f"{missing}: there is no such file."
+        assert said == f"{missing}: does not exist."

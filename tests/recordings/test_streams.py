@@ -303,7 +303,7 @@ def test_a_spooled_capture_is_called_standard_input(tmp_path: Path) -> None:
         send(process, b"KCB1" * 30)
         code, messages = ended(process)
     assert code == 2
-    assert messages.startswith("kontronik-can-gw convert: standard input: has no header")
+    assert messages.startswith("kontronik-can-gw convert: standard input: has no readable header")
 
 
 @pytest.mark.parametrize("kind", ["bytes", "candump", "blf"])

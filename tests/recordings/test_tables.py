@@ -120,7 +120,7 @@ def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_p
     assert convert(source, tmp_path / "out.mf4", "--to", "mf4-log") == 0
     with asammdf.MDF(tmp_path / "out.mf4") as mdf:
         assert "e0: KOSMIK 200, firmware 1.2, V4 layout, at /dev/ttyUSB0" in mdf.header.comment
-        assert "e1: device not known, at /dev/ttyUSB1" in mdf.header.comment
+        assert "e1: unknown device, at /dev/ttyUSB1" in mdf.header.comment
         assert 0 <= mdf.header.start_time.timestamp() - WALL_NS / 1e9 < 0.1
 
 

@@ -298,7 +298,7 @@ def test_words_of_errors_and_states_become_events() -> None:
     assert list(bec) == [7.5, None, 7.5, None, 7.5], "a float signal may be infinite"
     assert [(e.begin_ns, e.end_ns, e.text, e.note) for e in events.in_order()] == [
         (0, 20, "Forward", ""),
-        (10, 20, "bit 30, unknown to this program", ""),
+        (10, 20, "unknown bit 30", ""),
         (20, 40, "battery voltage too low", "until telemetry was lost"),
         (20, 30, "state 99", ""),
         (30, 40, "state odd", ""),

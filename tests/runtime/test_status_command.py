@@ -153,7 +153,7 @@ def test_a_document_older_than_three_seconds_shows_no_value() -> None:
     assert judged(document, STALE_NS).code == HEALTHY
     seen = judged(document, 12 * SECOND)
     assert seen.code == NOT_RUNNING
-    assert seen.sentence == "has written nothing for 12.0 s (ended, held up, or the disk is full)"
+    assert seen.sentence == "has written nothing for 12.0 s (ended, blocked, or the disk is full)"
     shown = words(seen)
     assert "has written nothing for 12.0 s" in shown
     assert "25." not in shown
@@ -174,7 +174,7 @@ def test_a_file_that_is_no_statistics_file_is_refused_in_one_line(tmp_path: Path
         assert refused(NOT_RUNNING, "status", "--file", file).startswith(f"{file}: is ")
     os.mkfifo(tmp_path / "pipe")
     for name, said in (
-        ("none", "no such file"),
+        ("none", "does not exist"),
         (".", "not a regular file"),
         ("pipe", "not a regular file"),
     ):
@@ -196,7 +196,7 @@ def test_a_configuration_selects_its_file_or_the_service_of_its_name(
         written(file, heard(), program_facts(tmp_path / "other.toml"))
         code, _, talk = shell("-c", toml)
         assert code == NOT_RUNNING
-        assert "other.toml, not of" in talk
+        assert "other.toml, not with" in talk
         written(file, heard(), program_facts(toml))
         code, out, _ = shell("-c", toml)
         assert code == HEALTHY

@@ -126,7 +126,7 @@ def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[Table]:
         for bit in range(32):
             if not mask >> bit & 1:
                 continue
-            about = (f"bit{bit}", "a bit that has no name yet", "Ask the manufacturer of the ESC.")
+            about = (f"bit{bit}", "a bit without a name", "Ask the manufacturer of the ESC.")
             if bit in named:
                 about = (named[bit].text, named[bit].meaning, named[bit].remedy)
             rows.append(_emergency(codes.code(bit), str(bit), None, about))

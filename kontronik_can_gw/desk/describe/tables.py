@@ -96,7 +96,10 @@ def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[Table]:
     ]
 
 
-_SIGNALS = "start counts as in DBC files. not available and error are raw values. page is the value of the multiplexer."
+_SIGNALS = (
+    "Column start: numbering as in DBC files. Columns not available and error: raw values. "
+    "Column page: value of the multiplexer."
+)
 
 
 def _message(plan: MessagePlan, message: Any) -> Row:
@@ -168,7 +171,7 @@ def _notes(message: MessagePlan, plan: SignalPlan) -> list[str]:
         if found is not None:
             notes.append(f"{found.name} reports the loss")
     if plan.unbound:
-        notes.append(f"bound to nothing: always {held(plan)}")
+        notes.append(f"not bound to a value: always {held(plan)}")
     elif plan.role is Role.CONSTANT:
         notes.append(f"always raw {plan.constant}")
     return [f"{note[:1].upper()}{note[1:]}." for note in notes]

@@ -44,7 +44,7 @@ def check_port(
     is_tty = status is not None and stat.S_ISCHR(status.st_mode)
     if status is None or not is_tty or not (is_pty or machine.exists(hardware)):
         named = ", ".join(machine.names("/dev/serial/by-id"))
-        there = f"; in /dev/serial/by-id there are {named}" if named else ""
+        there = f". Available in /dev/serial/by-id: {named}" if named else ""
         findings.say("port.exists", "no_port" if status else "none", there=there)
         return findings.found
     usb = _adapter(machine, machine.real(f"{hardware}/device"))

@@ -103,7 +103,7 @@ def check_folder(
         case = "by_systemd"
     elif not machine.may(str(there), os.W_OK | os.X_OK):
         case = "gateway" if machine.runs_gateway else "closed"
-    made = "" if str(there) == folder else ", will be made"
+    made = "" if str(there) == folder else ", will be created"
     space = {"free": free // 1_000_000, "needed": needed // 1_000_000}
     names = {"what": what, "folder": folder, "there": there, "user": machine.user}
     findings.say("config.folder", case, made=made, **names, **space)

@@ -87,7 +87,7 @@ def cut(lines: list[Text], room: int) -> list[Text]:
         return lines
     if room <= 0:
         return []
-    more = line((f"... and {len(lines) - room + 1} lines more: enlarge the terminal", "dim"))
+    more = line((f"... and {len(lines) - room + 1} more lines: enlarge the terminal", "dim"))
     return [*lines[: room - 1], more]
 
 

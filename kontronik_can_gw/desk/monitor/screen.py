@@ -39,10 +39,10 @@ from kontronik_can_gw.times import MS
 _LEVELS = "▁▂▃▄▅▆▇█"
 _MARKS = {"": "bold", "!": "bold yellow", "!!": "bold red"}
 """Styles of marked values. The marks themselves are for displays without colour."""
-_NO_TELEMETRY = "no telemetry{since}: is the ESC powered, its cable plugged in?"
+_NO_TELEMETRY = "no telemetry{since}: is the ESC powered and its cable plugged in?"
 _TROUBLES = {
-    "searching": "bytes come but no telemetry: right port? Does the ESC send {protocol} telemetry?",
-    "porterror": "the gateway cannot open the port: look at its log, or kontronik-can-gw status",
+    "searching": "bytes but no telemetry: is it the right port? Does the ESC send {protocol} telemetry?",
+    "porterror": "the gateway cannot open the port: see its log, or kontronik-can-gw status",
 }
 _PAGE_WIDTHS = (16, 5, 8, 8, 8)
 """Minimum widths of a page's columns: name, unit, value, minimum, maximum."""
@@ -112,7 +112,7 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, str]]:
     if source.problem:
         yield source.problem, "bold red"
     elif source.ended and not monitor.view.frames:
-        text = f"{source.name} holds no frame of {monitor.file}."
+        text = f"{source.name} contains no frame of {monitor.file}."
         yield f"{text} Give the DBC of its frames (-c, --dbc).", "bold red"
     elif monitor.silent_ns >= SILENCE_NS and not source.is_file:
         yield f"no {frames}", "bold red"
@@ -123,8 +123,8 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, str]]:
     count = monitor.gateway.number("esc_count")
     known = len(monitor.escs)
     if count is not None and count > known:
-        text = f"the gateway has {count:.0f} ESCs, the DBC in use describes {known}: "
-        yield text + "give its configuration (-c) or DBC (--dbc).", "yellow"
+        text = f"the gateway has {count:.0f} ESCs, but the DBC in use describes {known}. "
+        yield text + "Give its configuration (-c) or DBC (--dbc).", "yellow"
 
 
 def _title(monitor: Monitor, source: Source) -> Text:
@@ -231,7 +231,7 @@ def _trouble(esc: Esc) -> Flag | None:
     if esc.is_known(Group.LIVE) or link in ("", "ok"):
         if link != "degraded":
             return None
-        remedy = "Look at cable and ground."
+        remedy = "Check cable and ground."
         return Flag("link", Severity.WARNING, "frames are damaged", remedy)
     age = esc.number("data_age")
     since = ""

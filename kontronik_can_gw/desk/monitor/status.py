@@ -143,8 +143,8 @@ def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
                 return Seen(file, NOT_RUNNING, f"{file}: {text}")
             document = json.loads(opened.read(_LARGEST_FILE))
     except FileNotFoundError:
-        text = f"{file}: not running: there is no such file. "
-        text += "Start the gateway whose statistics.file it is."
+        text = f"{file}: does not exist, so its gateway does not run. "
+        text += "Start the gateway that has it as statistics.file."
         if config is not None:
             start = f"Start it: kontronik-can-gw run -c {config}"
             text = f"{config}: no gateway runs with this configuration. {start}"
@@ -164,7 +164,7 @@ def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
         other = Path(seen.document["configuration"])
         if other.resolve() == config.resolve():
             return seen
-        text = f"is of the gateway with {printable(str(other))}, not of {config}."
+        text = f"is from the gateway with {printable(str(other))}, not with {config}."
     return Seen(file, NOT_RUNNING, f"{file}: {text}")
 
 
@@ -178,7 +178,7 @@ def judge(file: Path, document: Any, now: int) -> Seen:
         if document["program"] != PROGRAM:
             return Seen(file, NOT_RUNNING, f"{file}: {FOREIGN}")
         if document["format"] != FORMAT:
-            text = f"is of another version of {PROGRAM} ({document['version']})."
+            text = f"was written by another version of {PROGRAM} ({document['version']})."
             return Seen(file, NOT_RUNNING, f"{file}: {text}")
         seen = _judge(file, document, now)
         list(lines_of(seen))  # a document that cannot be shown is foreign
@@ -193,7 +193,7 @@ def _judge(file: Path, document: Document, now: int) -> Seen:
     if abs(age) > STALE_NS:
         text = "not running"  # a time in the future: the machine was restarted
         if age > 0:
-            text = f"has written nothing for {duration(age)} (ended, held up, or the disk is full)"
+            text = f"has written nothing for {duration(age)} (ended, blocked, or the disk is full)"
         return Seen(file, NOT_RUNNING, text, (), age_s, document)
     troubles = tuple(map(printable, _troubles(document)))
     sentence = printable(document["gateway"]["state"])
@@ -241,7 +241,7 @@ def lines_of(seen: Seen) -> Iterator[Text]:
         return
     if seen.code == NOT_RUNNING:
         yield from wrapped(f"{PROGRAM} {document['version']}  {seen.sentence}", "bold red", _WIDTH)
-        yield line((f"{document['configuration']}, last heard of {document['time']}", "dim"))
+        yield line((f"{document['configuration']}, last status at {document['time']}", "dim"))
         if seen.is_service:
             yield line((f"Why? journalctl -e -u '{PROGRAM}*'", "dim"))
     else:
@@ -297,7 +297,7 @@ def _can_lines(document: Document) -> Iterator[Text]:
         "id_conflicts": "id conflicts",
     }
     counts = ", ".join(f"{number(can['counters'][key])} {label}" for key, label in labels.items())
-    yield from wrapped(f"     in all: {counts}", "dim", _WIDTH)
+    yield from wrapped(f"     total: {counts}", "dim", _WIDTH)
 
 
 def _esc_rows(document: Document) -> Iterator[list[Part]]:
@@ -357,7 +357,7 @@ def _further(document: Document) -> Iterator[Text]:
             yield from wrapped(printable(text), "", _WIDTH)
     store = document["store"]
     if store and store["waiting"] > 0:
-        yield line((f"{store['waiting']} parameters wait for the disk", "yellow"))
+        yield line((f"{store['waiting']} parameters are waiting for the disk", "yellow"))
     recording = document["recording"]
     if recording and recording["file"]:
         lost = f", {recording['lost']:.0f} entries lost" if recording["lost"] else ""

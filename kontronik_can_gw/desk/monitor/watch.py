@@ -145,7 +145,7 @@ def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> 
         file = monitor.file
         name = source.name
         if source.is_file:
-            raise RunError(f"{name}: holds no frame of {file}. Give its DBC (--dbc).")
+            raise RunError(f"{name}: contains no frame of {file}. Give its DBC (--dbc).")
         silence = f"no frame of {file} on {name} for {timeout:g} s."
         reason = " ".join([silence, *source.hints])
         raise RunError(source.problem or reason)

@@ -41,7 +41,7 @@ def password(file: str) -> str:
     except OSError as error:
         raise OSError(f"{file}: the password cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise OSError(f"{file}: the password is no text in UTF-8") from None
+        raise OSError(f"{file}: the password is not UTF-8 text") from None
     if not line:
         raise OSError(f"{file}: has no password on its first line")
     return line
@@ -153,7 +153,8 @@ class MqttClient:
             self._client.loop_start()
         except OSError as error:
             raise RunError(
-                f"127.0.0.1: {error.strerror or error}. MQTT needs this machine's own network: sudo ip link set lo up"
+                f"127.0.0.1: {error.strerror or error}. "
+                "MQTT needs the loopback interface: sudo ip link set lo up"
             ) from None
 
     def offer(self, message: Publication) -> None:
@@ -218,7 +219,10 @@ class MqttClient:
         self._has_answered = True
         if reason.is_failure:
             text = str(reason).lower()
-            self.problem = f"refuses the connection: {text}. Check username, password_file and gateway of [mqtt]."
+            self.problem = (
+                f"refuses the connection: {text}. "
+                "Check username, password_file and gateway of [mqtt]."
+            )
             return
         self._connections += 1
         self._ended.clear()
@@ -234,12 +238,12 @@ class MqttClient:
     def _on_disconnect(self, *_: object) -> None:
         if self.problem == "":
             self.problem = (
-                "the connection was lost. If that goes on: does another program use the client id "
-                f"{self._client_id!r} (mqtt.gateway)?"
+                "the connection was lost. If this repeats, another program may use the client id "
+                f"{self._client_id!r} (mqtt.gateway)."
             )
         elif not self._has_answered:
             self.problem = (
-                "does not answer as an MQTT broker. Is the port right, does it want mqtt.tls?"
+                "does not answer like an MQTT broker. Is the port right? Does it need mqtt.tls?"
             )
         self._ended.set()
 

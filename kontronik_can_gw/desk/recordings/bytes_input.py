@@ -49,8 +49,8 @@ class BytesInput(PlayedInput):
         layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
         if len(layout.escs) != 1:
             raise UserError(
-                f"{path}: holds the bytes of one ESC, "
-                f"{layout.layout.file} describes {len(layout.escs)}"
+                f"{path}: contains the bytes of one ESC, "
+                f"but {layout.layout.file} describes {len(layout.escs)}"
             )
         self._path = path
         timeout_ns = max(layout.escs[0].timeout_ns, 3 * PERIOD_NS)
@@ -63,7 +63,7 @@ class BytesInput(PlayedInput):
         self.provenance["times"] = "assumed: 100 live frames a second"
         if layout.config is None:
             self.provenance["motor"] = (
-                "pole pairs and gear taken as 1 (a configuration, -c, tells them)"
+                "pole pairs and gear assumed to be 1 (a configuration, -c, sets them)"
             )
 
     def entries(self) -> Iterator[Entry]:
@@ -177,7 +177,7 @@ class BytesInput(PlayedInput):
             self.refusal = self._refusal(counters)
         if counters.dropped_bytes:
             self.damage.append(
-                f"{counters.dropped_bytes} bytes belong to no frame, "
+                f"{counters.dropped_bytes} bytes outside of frames, "
                 f"{counters.crc_errors} CRC errors"
             )
         if not counters.live:

@@ -150,10 +150,10 @@ class CaptureInput(PlayedInput):
         yield replay.finish()
         if replay.lost:
             self.damage.append(
-                f"{replay.lost} entries could not be recorded: the disk was too slow or full"
+                f"{replay.lost} entries could not be recorded, because the disk was too slow or full"
             )
         if replay.rejected:
-            self.damage.append(f"{replay.rejected} entries make no sense to this version")
+            self.damage.append(f"{replay.rejected} entries cannot be interpreted by this version")
 
     def _steps(self, replay: Replay, player: "Player | None") -> Iterator[list[TimedFrame]]:
         """Play all entries on the gateway of ``replay``. Yield the frames of each entry.
@@ -244,7 +244,7 @@ class CaptureInput(PlayedInput):
             "DBC": dbc,
         }
         for index, (esc, port) in enumerate(zip(setup.escs, setup.ports, strict=False)):
-            known = "device not known"
+            known = "unknown device"
             if index < len(self._devices) and isinstance(self._devices[index], dict):
                 device = self._devices[index]
                 known = (
@@ -264,10 +264,9 @@ class CaptureInput(PlayedInput):
             self.close()
             if len(self._paths) == 1:
                 raise UserError(
-                    f"{path}: has no header that could be read, "
-                    "so nothing is known of what was recorded"
+                    f"{path}: has no readable header, so its content cannot be interpreted"
                 )
-            self._headerless.append(f"{path.name}: has no header that could be read")
+            self._headerless.append(f"{path.name}: left out, because it has no readable header")
             del self._paths[0]
 
     def _blocks(self, path: Path, limit: int = 1 << 62) -> Iterator[DataBlock | Damage]:
@@ -299,7 +298,7 @@ class CaptureInput(PlayedInput):
                     continue
                 missing = found.number - expected
                 if missing > 0:
-                    text = f"{missing} blocks in front of byte {found.offset} are missing"
+                    text = f"{missing} blocks before byte {found.offset} are missing"
                     self._add_damage(f"{path.name}: {text}")
                 expected = found.number + 1
                 is_closed = found.kind == b"E"
@@ -309,16 +308,16 @@ class CaptureInput(PlayedInput):
                 elif found.kind in (b"I", b"H"):
                     self._read_json(found, path, number)
             if not is_closed:
-                text = "was not closed: up to the last second before its end may be missing"
+                text = "was not closed, so up to a second may be missing at its end"
                 self._add_damage(f"{path.name}: {text}")
         if self._impossible:
-            self.damage.append(f"{self._impossible} entries have no possible time")
+            self.damage.append(f"{self._impossible} entries have an impossible time")
 
     def _add_damage(self, text: str) -> None:
         if len(self.damage) < _MAX_DAMAGE:
             self.damage.append(text)
         elif len(self.damage) == _MAX_DAMAGE:
-            self.damage.append("and more of that kind")
+            self.damage.append("and further damage")
 
     def _read_json(self, block: DataBlock, path: Path, part: int) -> None:
         try:
@@ -334,7 +333,7 @@ class CaptureInput(PlayedInput):
     def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
         if header.get("run") != self.header.get("run"):
             raise UserError(
-                f"{path}: is of another run than {self._paths[0]}. Convert each run by itself."
+                f"{path}: is part of another run than {self._paths[0]}. Convert each run separately."
             )
         clock = _clock_of(header)
         if clock is not None:
@@ -342,12 +341,10 @@ class CaptureInput(PlayedInput):
         number = header.get("part", part)
         first = self.header.get("part", 0)
         if type(number) is not int:
-            raise ValueError("has a part that is no number")
+            raise ValueError("has a part number that is not an integer")
         missing = number - int(first) - part
         if missing > 0:
-            self.damage.append(
-                f"{path.name}: {missing} parts of the run in front of it are not given"
-            )
+            self.damage.append(f"{path.name}: {missing} earlier parts of the run are not given")
 
 
 def _clock_of(header: Mapping[str, Any]) -> tuple[int, int] | None:
@@ -363,7 +360,7 @@ def _clock_of(header: Mapping[str, Any]) -> tuple[int, int] | None:
 
 def _header_error(path: Path, error: Exception) -> UserError:
     """Return the message for a header that cannot be used because of ``error``."""
-    problems = ["the header cannot be used: it is not as a recorder writes it"]
+    problems = ["the header cannot be used, because its format is invalid"]
     if isinstance(error, UserError):
         problems = list(error.problems)
     elif isinstance(error, HeaderError):

@@ -177,7 +177,7 @@ def to_log(
     seconds = (last_ns - origin_ns) / 1e9
     summary = f"{frames_written}, up to {seconds:.3f} s"
     for what, number in writer.left_out.items():
-        summary += f"; {counted(number, what)} left out, which {form} does not know"
+        summary += f"; {counted(number, what)} left out, which {form} does not support"
     if writer.channels.changes:
         summary += f"; channels: {writer.channels.changes}"
     return summary

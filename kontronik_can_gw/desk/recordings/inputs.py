@@ -122,8 +122,8 @@ def _open_spooled(stream: Stream, layout: BusLayout | None) -> Input:
             shutil.copyfileobj(io.BufferedReader(stream, HEAD), file, HEAD)
         except OSError as error:
             raise RunError(
-                f"{tempfile.gettempdir()}: {stream.name} cannot be stored there: "
-                f"{error.strerror}. Set TMPDIR to a folder with more room."
+                f"{tempfile.gettempdir()}: {stream.name} cannot be stored: "
+                f"{error.strerror}. Set TMPDIR to a folder with more space."
             ) from None
         path = Path(f"/proc/self/fd/{file.fileno()}")
         try:
@@ -156,11 +156,11 @@ def _parts(path: Path) -> list[Path] | None:
     runs = list(dict.fromkeys(name.rpartition("-")[0] for name in names))
     if len(runs) > 1:
         raise UserError(
-            f"{path}: has captures of {len(runs)} runs; "
-            f"give the beginning of the names of one: {', '.join(runs[-8:])}"
+            f"{path}: has captures of {len(runs)} runs. "
+            f"Give the common prefix of one run: {', '.join(runs[-8:])}"
         )
     return found
 
 
 def _missing(path: Path) -> UserError:
-    return UserError(f"{path}: there is no such file.")
+    return UserError(f"{path}: does not exist.")

@@ -63,7 +63,7 @@ def shown_by(layout: BusLayout, known: Sequence[EscSettings]) -> BusLayout:
         return _compile_layout(layout.database, own.node, own.file, known)
     if len(layout.escs) != len(known):
         raise UserError(
-            f"{layout.config.file}: has {len(layout.escs)} ESCs, the recording {len(known)}"
+            f"{layout.config.file}: has {len(layout.escs)} ESCs, but the recording has {len(known)}"
         )
     return layout
 
@@ -75,7 +75,7 @@ def _compile_layout(
 
     names = esc_names(database, node)
     if names and known and len(names) != len(known):
-        raise UserError(f"{file}: describes {len(names)} ESCs, the recording has {len(known)}")
+        raise UserError(f"{file}: describes {len(names)} ESCs, but the recording has {len(known)}")
     escs = list(known)
     if names and known:
         escs = [replace(esc, name=name) for esc, name in zip(known, names, strict=True)]

@@ -184,7 +184,7 @@ class CanLogInput(Input):
             self.damage.append(f"{clock.impossible} frame{plural} with an impossible time left out")
         if self._channels and selected is not None and selected not in self._channels:
             listed = ", ".join(sorted(self._channels))
-            raise UserError(f"{self._path}: has no channel {selected}. It has: {listed}.")
+            raise UserError(f"{self._path}: has no channel {selected}. Available: {listed}.")
 
     def _ambiguous(self, logged: Iterator[LogFrame]) -> UserError:
         """Return the error for several channels with messages of the DBC. It lists all channels."""

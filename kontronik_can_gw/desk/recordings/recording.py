@@ -192,8 +192,8 @@ class Input(ABC):
         if self.others:
             file = Path(self.bus.layout.file).name
             parts.append(
-                f"{self.others} CAN frames left out that {file} does not have "
-                "(-c or --dbc gives another)"
+                f"{self.others} CAN frames left out that are not in {file} "
+                "(for another DBC give -c or --dbc)"
             )
         counts = [counted(number, kind) for kind, number in self.without_data.items()]
         if counts:
@@ -218,7 +218,7 @@ class Input(ABC):
     def select_channel(self, name: str) -> None:
         """Read only one channel of a CAN log. Raises UserError for other recordings."""
         raise UserError(
-            f"{self.name}: is no CAN log, so --channel {name} means nothing. Leave it out."
+            f"{self.name}: is not a CAN log, so --channel {name} has no effect. Leave it out."
         )
 
     @abstractmethod

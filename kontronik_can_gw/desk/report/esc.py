@@ -309,7 +309,7 @@ class EscFlight:
             self._set.remove(key)
             self._events.end(key, now, lost=is_lost)
         elif is_set and key not in self._set:
-            event = Event("error", self._index, now, f"bit {bit}, unknown to this program", "error")
+            event = Event("error", self._index, now, f"unknown bit {bit}", "error")
             known = next((one for one in self._protocol.errors[word] if one == bit), None)
             if known is not None:
                 if known.is_normal:

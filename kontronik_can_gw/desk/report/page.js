@@ -1,6 +1,7 @@
 "use strict";
-// The page of one flight: plots by uPlot with one common time range and cursor, a band of operating states and errors, the list of
-// events. Times are seconds of the recording. Text of the input only ever becomes text nodes.
+// The page of one flight: plots by uPlot with one common time range and cursor, a band of operating
+// states and errors, and the list of events. Times are seconds of the recording. Text of the input
+// becomes only text nodes, so it cannot inject HTML.
 (async () => {
   const byId = (id) => document.getElementById(id);
   const packed = Uint8Array.from(atob(byId("data").textContent), (c) => c.charCodeAt(0));
@@ -34,7 +35,7 @@
     return node;
   }
 
-  // Of several ESCs each has its colour and dashes; of one alone, each line of a plot.
+  // With several ESCs, each ESC has its own colour and dashes. With one ESC, each line of a plot has.
   const colour = (style) => `--c${style % COLOURS}`;
   const dashes = (style) => Object.keys(DASHES)[style % 3];
   const withSpaces = (text) => text.replaceAll(",", "\u202f").replace("-", "−");
@@ -86,10 +87,10 @@
 
   const stateAt = (esc, t) => states[esc].findLast((state) => state.from <= t && t <= end(state));
 
-  // Seconds of the long gaps in front of a time, which are not on the page.
+  // Seconds of the long gaps before a time, which are cut out of the page.
   const cutBefore = (t) => data.cuts.reduce((sum, [begin, length]) => sum + (t > begin ? length : 0), 0);
 
-  // What is at the cursor, in the bar.
+  // Shows the time, states and errors at the cursor in the bar.
   function showNow() {
     const t = cursorTime;
     if (t === null) return byId("now").replaceChildren(`${clock(range[0])} to ${clock(range[1])}`);
@@ -108,7 +109,7 @@
 
   // --- plots
 
-  // A line where each error begins, and a shade to its end.
+  // Draws a line at the begin of each error, and a shade to its end.
   function drawMarks(u) {
     const { ctx, bbox } = u;
     const ratio = devicePixelRatio || 1;
@@ -138,7 +139,7 @@
     return splits.map((t) => clock(t, digitsOf(step)));
   }
 
-  // Least distance of two time labels: the longest label, and a gap.
+  // Returns the least distance of two time labels: the longest label and a gap.
   function timeSpace(u, index, from, to, width) {
     const step = ((to - from) * 70) / Math.max(width, 70);
     const longest = Math.max(clock(from, digitsOf(step)).length, clock(to, digitsOf(step)).length);
@@ -196,11 +197,11 @@
 
   // --- lines over time
 
-  // Points with gaps on both sides, which no line shows.
+  // Returns the points with gaps on both sides, which no line shows.
   const isolated = (values) => [...values.keys()].filter((i) =>
     values[i] !== null && (values[i - 1] ?? null) === null && (values[i + 1] ?? null) === null);
 
-  // The value at the cursor; none if it stands between the point next to it and one without a value.
+  // Returns the value at the cursor. No value if the next point on the other side of the cursor has none.
   function valueAt(u, values, index, digits) {
     const t = u.posToVal(u.cursor.left, "x");
     const isOn = index === null || Math.abs(u.valToPos(data.times[index], "x") - u.cursor.left) <= 3;
@@ -220,7 +221,7 @@
     const series = spec.series.map((item) => {
       const single = item.drawn ? isolated(item.values) : [];
       return {
-        // a line that is not drawn has a scale of its own, on which it would cover the one that is
+        // A line that is not drawn has its own scale, on which it would coincide with the drawn line.
         scale: item.drawn ? "y" : `y${item.line}`,
         ...(item.drawn ? {} : { paths: () => null }),
         label: [several ? data.escs[item.esc] : "", several && spec.lines.length === 1 ? "" : spec.lines[item.line]].join(" ").trim(),
@@ -249,9 +250,10 @@
     plot.showLines = () => spec.series.forEach((item, index) => plot.u.setSeries(index + 1, { show: visible[item.esc] }));
   }
 
-  // --- the band: texts of errors, below them a row of operating states for each ESC
+  // --- the band: texts of errors, and below them a row of operating states for each ESC
 
-  // Each text begins at its mark, in a row where it covers no other; errors come before warnings. Returns what finds no room.
+  // Each text begins at its mark, in a row in which it covers no other text. Errors have priority over
+  // warnings. Returns the number of texts for which there is no room.
   function drawErrorTexts(u, ratio, rows) {
     const { ctx, bbox } = u;
     const taken = Array.from({ length: rows }, () => []);
@@ -341,7 +343,7 @@
     }, { passive: false });
 
     const fingers = new Map();
-    let held = null; // times below the two fingers when they came down
+    let held = null; // times below the two fingers when they touched
     over.addEventListener("pointerdown", (event) => {
       if (event.pointerType !== "touch") return;
       fingers.set(event.pointerId, event.clientX);
@@ -461,6 +463,6 @@
     fit();
   });
 
-  // For a look at the data from the console, and for the tests.
+  // Gives the console and the tests access to the data.
   globalThis.flight = { data, plots, setRange, setCursor, range: () => [...range] };
 })();

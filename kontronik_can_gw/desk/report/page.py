@@ -214,7 +214,7 @@ def _damage(damage: Sequence[str]) -> str:
     if not damage:
         return ""
     lines = "".join(f"<li>{escape(line)}</li>" for line in damage)
-    title = "<strong>The input is damaged; what is intact is shown.</strong>"
+    title = "<strong>The input is damaged. The intact parts are shown.</strong>"
     return f'<div class="damage">{title}<ul>{lines}</ul></div>'
 
 
@@ -238,8 +238,8 @@ def _notes(flight: Flight) -> str:
     if flight.points.rows_in_bucket > 1:
         lines.append(
             "Lines are drawn from the minimum and the maximum of each "
-            f"{flight.points.rows_in_bucket} rows: no peak is lost, its time is exact to within "
-            "them. All numbers in the tables are from every row."
+            f"{flight.points.rows_in_bucket} rows. No peak is lost, and its time is exact to within "
+            "these rows. All numbers in the tables are computed from every row."
         )
     if any("battery_power" in esc.computed for esc in flight.escs):
         lines.append(

@@ -73,7 +73,7 @@ MINIMA = {
 }
 COUNTERS = {
     "consumed_charge": "Charge used",
-    "losses": "Losses of the link",
+    "losses": "Link losses",
     "crc_errors": "CRC errors",
     "dropped_bytes": "Bytes dropped",
 }

@@ -119,8 +119,7 @@ class BlfReader(LibraryReader):
             return
         self._reader = reader
         if size < reader.file_size < 1 << 48:
-            sizes = f"{size} of its {reader.file_size} bytes are there"
-            self.damage.append(f"the file is cut off: {sizes}")
+            self.damage.append(f"the file is cut off after {size} of {reader.file_size} bytes")
         else:
             problem = _container_problem(file, size)
             if problem:
@@ -146,7 +145,7 @@ def _container_problem(file: BinaryIO, end: int) -> str | None:
     while problem is None and len(head := file.read(16)) == 16 and head.startswith(b"LOBJ"):
         size = int.from_bytes(head[8:12], "little")
         if size < len(head) or at + size > end:
-            problem = f"a container of {size} bytes at byte {at}"
+            problem = f"the container at byte {at} has the impossible size {size}"
         at = file.seek(at + size + size % 4)
     file.seek(first)
     return problem
@@ -171,8 +170,8 @@ class Mf4Reader(LibraryReader):
         if groups and not any(name.startswith("CAN_") for name in names):
             self.close()
             raise UserError(
-                f"{path}: is a table of values (an MF4 measurement), no log of a CAN bus. "
-                "Give the recording it was made of."
+                f"{path}: is a table of values (an MF4 measurement), not a log of a CAN bus. "
+                "Give the recording from which it was made."
             )
         if start_s >= OLDEST_WALL_S:
             # asammdf converts local times, but only ``abs_time`` has the exact fraction of a second

@@ -346,10 +346,10 @@ class TrcReader(TextReader):
         try:
             parser._extract_header()
         except (ValueError, OverflowError):
-            self.damage.append("its head is damaged")
+            self.damage.append("its header is damaged")
         if parser.file_version is TRCFileVersion.UNKNOWN and _NEWER_TRC.search(head):
             parser._parse_cols = lambda _: None
-            self.damage.append("its file version is not known")
+            self.damage.append("its file version is unknown")
         version = "".join(filter(str.isdigit, parser.file_version.name))
         self._columns = _TRC_COLUMNS.get(version, parser.columns)
         self._has_direction = version not in ("", "10")
