@@ -150,7 +150,11 @@ def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
 
 
 def _report(
-    args: argparse.Namespace, form: str, recording: Input, summary: str | None, seconds: float
+    args: argparse.Namespace,
+    form: str,
+    recording: Input,
+    summary: str | None,
+    seconds: float,
 ) -> None:
     """Report the result and the damage.
 

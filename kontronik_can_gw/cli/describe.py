@@ -42,14 +42,27 @@ _TITLE = "What the gateway sends and what it means"
 def main(args: argparse.Namespace) -> int:
     """Write the description. Raises UserError for faulty input, RunError if writing fails."""
     tables = _tables(args)
-    text = markdown(_TITLE, [f"Made by kontronik-can-gw {__version__} describe."], tables)
     if args.format == "json":
-        facts = {table.title.lower().replace(" ", "_"): table.rows for table in tables}
-        head = {"format": "kontronik-can-gw description", "version": 2, "program": __version__}
-        text = printable_json({**head, **facts}, indent=2, allow_nan=False) + "\n"
+        text = _json(tables)
+    else:
+        lead = [f"Made by kontronik-can-gw {__version__} describe."]
+        text = markdown(_TITLE, lead, tables)
+    text = printable(text, keep="\n\t")
     inputs = configuration_files(args.config, args.dbc)
-    write_output(args.output, printable(text, keep="\n\t"), inputs, force=args.force)
+    write_output(args.output, text, inputs, force=args.force)
     return 0
+
+
+def _json(tables: list[Table]) -> str:
+    document: dict[str, object] = {
+        "format": "kontronik-can-gw description",
+        "version": 2,
+        "program": __version__,
+    }
+    for table in tables:
+        key = table.title.lower().replace(" ", "_")
+        document[key] = table.rows
+    return printable_json(document, indent=2, allow_nan=False) + "\n"
 
 
 def _tables(args: argparse.Namespace) -> list[Table]:

@@ -24,7 +24,9 @@ def given_layout(args: argparse.Namespace) -> BusLayout | None:
 
     Raises UserError with all mistakes.
     """
-    return bus_layout(args) if args.config or args.dbc else None
+    if args.config or args.dbc:
+        return bus_layout(args)
+    return None
 
 
 def bus_layout(args: argparse.Namespace) -> BusLayout:
@@ -51,7 +53,9 @@ OpenInput = Callable[[Path, BusLayout | None], Input]
 
 @contextmanager
 def reading(
-    path: Path, layout: BusLayout | None, opened_by: OpenInput = open_input
+    path: Path,
+    layout: BusLayout | None,
+    opened_by: OpenInput = open_input,
 ) -> Iterator[Input]:
     """Open a recording.
 
@@ -86,10 +90,11 @@ def watched(blocks: Iterable[_Block], name: str, data_on_screen: bool) -> Iterat
         return
     from rich import console, progress
 
-    columns = ("{task.description}", "{task.completed:,}", "after", "{task.elapsed:.0f} s")
-    shown = [progress.TextColumn(text, markup=False) for text in columns]
+    columns: list[progress.ProgressColumn] = [progress.SpinnerColumn()]
+    for text in ("{task.description}", "{task.completed:,}", "after", "{task.elapsed:.0f} s"):
+        columns.append(progress.TextColumn(text, markup=False))
     screen = console.Console(stderr=True)
-    with progress.Progress(progress.SpinnerColumn(), *shown, console=screen, transient=True) as bar:
+    with progress.Progress(*columns, console=screen, transient=True) as bar:
         task = bar.add_task(printable(name), total=None)
         for block in blocks:
             bar.advance(task, len(block))

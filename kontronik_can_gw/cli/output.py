@@ -100,7 +100,10 @@ def output_of(args: argparse.Namespace, name: str, default: str | None = None) -
 
 @contextmanager
 def writing(
-    output: str, *, keeps_part: bool = False, handles_signals: bool = True
+    output: str,
+    *,
+    keeps_part: bool = False,
+    handles_signals: bool = True,
 ) -> Iterator[Output]:
     """Open an output for writing. Raises RunError if it cannot be written.
 
@@ -127,7 +130,12 @@ def writing(
 
 
 def write_output(
-    output: str, text: str, inputs: Iterable[Path] = (), *, force: bool, encoding: str = "utf-8"
+    output: str,
+    text: str,
+    inputs: Iterable[Path] = (),
+    *,
+    force: bool,
+    encoding: str = "utf-8",
 ) -> None:
     """Write text to a file and report that, or to standard output for ``-``.
 

@@ -33,7 +33,10 @@ def in_words(config: Config, folder: Path) -> str:
 
 
 def recorded(
-    loaded: Loaded, given: Path | None, now: int, silent_on_loss: bool
+    loaded: Loaded,
+    given: Path | None,
+    now: int,
+    silent_on_loss: bool,
 ) -> tuple[Gateway, Recorder]:
     """Return the gateway of a configuration and its recorder.
 

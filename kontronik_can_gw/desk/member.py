@@ -19,7 +19,6 @@ from kontronik_can_gw.signals.unpacker import Value
 
 _WORDS = {"operating_errors": Group.LIVE, "selftest_errors": Group.INFO}
 """The error words, and the group in which each is available."""
-_SEVERITIES = list(Severity)
 
 
 class Flag(NamedTuple):
@@ -41,10 +40,15 @@ def alarms_of(flags: Iterable[Alarm]) -> list[Alarm]:
 
     Normal bits are left out, and summaries of other alarms in the result.
     """
-    found = [flag for flag in flags if not flag.is_normal]
-    explained = {flag.severity for flag in found if not flag.is_summary}
-    found = [flag for flag in found if not flag.is_summary or flag.severity not in explained]
-    return sorted(found, key=lambda flag: _SEVERITIES.index(flag.severity))
+    faults = [flag for flag in flags if not flag.is_normal]
+    explained = {flag.severity for flag in faults if not flag.is_summary}
+    found = []
+    for severity in Severity:
+        for flag in faults:
+            is_redundant = flag.is_summary and severity in explained
+            if flag.severity is severity and not is_redundant:
+                found.append(flag)
+    return found
 
 
 class Member:
@@ -53,8 +57,12 @@ class Member:
     def __init__(self, view: View, settings: EscSettings | None, index: int | None) -> None:
         self.view = view
         self.index = index
-        self.name = "" if settings is None else settings.name
-        self.protocol = protocol_named(None if settings is None else settings.protocol)
+        self.name = ""
+        protocol = None
+        if settings is not None:
+            self.name = settings.name
+            protocol = settings.protocol
+        self.protocol = protocol_named(protocol)
         self.columns: dict[str, int] = {}
         """Index of the first column in the layout of each value by name."""
         for at, column in enumerate(view.reader.columns):
@@ -77,7 +85,8 @@ class Member:
         """Factor and offset of values whose signal has another unit than their source."""
         for name, at in self.columns.items():
             unit = VALUES[name].unit
-            conversion = units.conversion(view.reader.columns[at].unit or unit, unit)
+            sent_unit = view.reader.columns[at].unit or unit
+            conversion = units.conversion(sent_unit, unit)
             if conversion is None:
                 continue
             factor, offset = conversion
@@ -105,19 +114,24 @@ class Member:
         if source in self.factors:
             factor, offset = self.factors[source]
             value = round(value * factor + offset, 9)
-        return value if math.isfinite(value) else None
+        if not math.isfinite(value):
+            return None
+        return value
 
     def number(self, source: str) -> float | None:
         """Return the value of a numeric source."""
         value = self.value(source)
-        return value if isinstance(value, (int, float)) else None
+        if isinstance(value, (int, float)):
+            return value
+        return None
 
     def text(self, source: str) -> str | None:
         """Return the text of an enumeration, even if the signal has no texts."""
         value = self.value(source)
-        if isinstance(value, (int, float)):
-            return VALUES[source].names.get(int(value), str(int(value)))
-        return value
+        if not isinstance(value, (int, float)):
+            return value
+        number = int(value)
+        return VALUES[source].names.get(number, str(number))
 
     def is_known(self, group: Group) -> bool:
         """Return True while a value of a group is available. Flags do not count."""
@@ -144,7 +158,9 @@ class Member:
             return value
         number = int(value)
         state = self.protocol.states.get(number)
-        return f"state {number}" if state is None else state.text
+        if state is None:
+            return f"state {number}"
+        return state.text
 
     @property
     def device(self) -> str | None:
@@ -152,7 +168,8 @@ class Member:
         value = self._first("device", "device_raw")
         names = self.protocol.devices
         if isinstance(value, (int, float)):
-            return names.get(int(value), f"device {int(value)}")
+            number = int(value)
+            return names.get(number, f"device {number}")
         if value is None:
             return None
         for name in names.values():
@@ -179,7 +196,10 @@ class Member:
         group = _WORDS[word]
         bits = self._bits[word]
         whole = self.number(word)
-        flags = {bit: self.view.values[at] for bit, at in bits.items() if at is not None}
+        flags = {}
+        for bit, at in bits.items():
+            if at is not None:
+                flags[bit] = self.view.values[at]
         if whole is None and all(value is None for value in flags.values()):
             return None
         has_other_values = bool(self.of_group[group])

@@ -115,13 +115,17 @@ def _samples(document: Document, age_s: float) -> Iterator[Sample]:
     yield "snapshot_age_seconds", round(age_s, 3), {}
     for name, place in _GATEWAY.items():
         yield name, _at(document, place), {}
-    yield "store_failed", None if store is None else store["last_error"] is not None, {}
-    yield "recording_failed", None if recording is None else recording["problem"] != "", {}
+    if store is not None:
+        yield "store_failed", store["last_error"] is not None, {}
+    if recording is not None:
+        yield "recording_failed", recording["problem"] != "", {}
     yield from _states("gateway_state", GatewayState, document["gateway"]["state"], {})
     yield "can_info", 1, {"interface": can["interface"], "channel": can["channel"]}
     yield from _states("can_state", CanState, can["state"], {})
-    for way, count in zip(("transmit", "receive"), can["error_counters"] or (), strict=False):
-        yield f"can_{way}_errors", count, {}
+    if can["error_counters"]:
+        transmit, receive = can["error_counters"]
+        yield "can_transmit_errors", transmit, {}
+        yield "can_receive_errors", receive, {}
     for key, count in can["counters"].items():
         yield f"can_{key.removesuffix('_count')}_total", count, {}
     for esc in document["escs"]:
@@ -142,8 +146,9 @@ def _esc(esc: Document, units: Mapping[str, str]) -> Iterator[Sample]:
             value /= 1000
         yield name, value, labels
     yield from _states("esc_link_state", LinkState, esc["link"], labels)
-    about = {key: esc[key] or "" for key in ("layout", "device", "variant", "firmware")}
-    yield "esc_info", None if esc["device"] is None else 1, labels | about
+    if esc["device"] is not None:
+        about = {key: esc[key] or "" for key in ("layout", "device", "variant", "firmware")}
+        yield "esc_info", 1, labels | about
     for kind, count in esc["port"]["line_errors"].items():
         yield "esc_port_line_errors_total", count, labels | {"kind": kind}
     for key, count in esc["counters"].items():
@@ -205,7 +210,10 @@ class _Handler(WSGIRequestHandler):
 
 
 def server_of(
-    look: Callable[[int], Seen], host: str, port: int, clock: Callable[[], int] = time.monotonic_ns
+    look: Callable[[int], Seen],
+    host: str,
+    port: int,
+    clock: Callable[[], int] = time.monotonic_ns,
 ) -> WSGIServer:
     """Return a server of the metrics of one gateway. Raises RunError if it cannot listen.
 

@@ -69,7 +69,12 @@ class NativePoller(Poller):
             os.read(self._signals[0], 4096)
 
     def turn(
-        self, can: "CanLink", last: int, due: int, leave: int, period: int
+        self,
+        can: "CanLink",
+        last: int,
+        due: int,
+        leave: int,
+        period: int,
     ) -> list[tuple[Handler, int]] | None:
         """Run turns in C until there is work for the loop. Returns the handlers to call then.
 

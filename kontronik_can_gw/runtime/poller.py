@@ -53,7 +53,11 @@ class Poller:
         """Watched descriptors that a driver has closed. They would always be readable."""
 
     def register(
-        self, fd: int, handler: Handler, events: int = _IN, esc: int | None = None
+        self,
+        fd: int,
+        handler: Handler,
+        events: int = _IN,
+        esc: int | None = None,
     ) -> None:
         """Watch a descriptor. If it is already watched, handler and events are replaced.
 

@@ -23,21 +23,18 @@ from kontronik_can_gw.times import MS
 _MASK = (at.SETTINGS, 6)
 """The object that selects the error bits reported as emergencies."""
 _EMERGENCIES = (
-    "An emergency of a CANopen node has the code in bytes 0 and 1 and the register 1001h in byte 2. Byte 3 is the number of the bit "
-    "in the ESC's error word, or FFh for a fault that the gateway detected. The log and kontronik-can-gw status report these faults too."
+    "An emergency of a CANopen node has the code in bytes 0 and 1 and the register 1001h in "
+    "byte 2. Byte 3 is the number of the bit in the ESC's error word, or FFh for a fault that the "
+    "gateway detected. The log and kontronik-can-gw status report these faults too."
 )
 
 
 def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
     """Return tables of the nodes' COB-IDs and TPDOs, and of their object dictionary."""
     eds = setup.eds
-    nodes = setup.nodes(escs).nodes
-    named = [(_title(node, esc), node) for node, esc in zip(nodes, escs, strict=True)]
-    ids = [
-        {"node": name, "cob_id": cob_id, "use": use}
-        for name, node in named
-        for cob_id, use in sorted({use.cob_id: use.what for use in node.uses()}.items())
-    ]
+    named = []
+    for node, esc in zip(setup.nodes(escs).nodes, escs, strict=True):
+        named.append((_title(node, esc), node))
     refused = ""
     if any(settings.read_only for settings in setup.settings):
         refused = "Nothing can be written over the bus: canopen.read_only is true."
@@ -47,14 +44,25 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
         Table(
             "COB-IDs",
             ["There is a node for each ESC. A node that waits for LSS uses only a few COB-IDs."],
-            ids,
+            list(_cob_ids(named)),
             by="node",
         ),
         Table(
-            "TPDOs", ["The TPDOs as they are when the node starts."], list(_pdos(named)), by="node"
+            "TPDOs",
+            ["The TPDOs as they are when the node starts."],
+            list(_pdos(named)),
+            by="node",
         ),
         Table("Objects", text, [_object(eds, entry, meanings) for entry in eds.entries]),
     ]
+
+
+def _cob_ids(nodes: Sequence[tuple[str, Node]]) -> Iterator[Row]:
+    """Yield a row for each COB-ID of each node."""
+    for name, node in nodes:
+        use_of = {use.cob_id: use.what for use in node.uses()}
+        for cob_id, use in sorted(use_of.items()):
+            yield {"node": name, "cob_id": cob_id, "use": use}
 
 
 def _title(node: Node, esc: EscSettings) -> str:
@@ -92,21 +100,32 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
     default: object = entry.default
     if isinstance(default, bytes):
         default = default.decode("latin-1")
-    name = eds.object_names[entry.index]
+    object_name = eds.object_names[entry.index]
+    name = entry.name
+    if not name.startswith(object_name):
+        name = f"{object_name}: {name}"
+    step = None
+    unit = ""
+    shows = ""
+    if bound is not None:
+        default = None
+        step = number(1 / bound.steps)
+        unit = bound.source.unit
+        shows = bound.source.name
     return {
         "object": entry.place,
-        "name": entry.name if entry.name.startswith(name) else f"{name}: {entry.name}",
+        "name": name,
         "type": TYPE_NAMES[entry.data_type],
         "access": entry.access,
         "pdo": entry.mappable,
-        "default": default if bound is None else None,
+        "default": default,
         "node_id": entry.relative,
         "min": entry.low,
         "max": entry.high,
-        "step": None if bound is None else number(1 / bound.steps),
-        "unit": "" if bound is None else bound.source.unit,
-        "shows": "" if bound is None else bound.source.name,
-        "meaning": "" if bound is None else meanings.get(bound.source.name, ""),
+        "step": step,
+        "unit": unit,
+        "shows": shows,
+        "meaning": meanings.get(shows, ""),
     }
 
 
@@ -122,14 +141,21 @@ def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[Table]:
         if not bits:
             continue
         codes = BitCodes(bits)
-        named = {int(bit): bit for bit in bits}
-        for bit in range(32):
-            if not mask >> bit & 1:
+        bit_of = {int(bit): bit for bit in bits}
+        for position in range(32):
+            if not mask >> position & 1:
                 continue
-            about = (f"bit{bit}", "a bit without a name", "Ask the manufacturer of the ESC.")
-            if bit in named:
-                about = (named[bit].text, named[bit].meaning, named[bit].remedy)
-            rows.append(_emergency(codes.code(bit), str(bit), None, about))
+            bit = bit_of.get(position)
+            if bit is None:
+                about = (
+                    f"bit{position}",
+                    "a bit without a name",
+                    "Ask the manufacturer of the ESC.",
+                )
+            else:
+                about = (bit.text, bit.meaning, bit.remedy)
+            code = codes.code(position)
+            rows.append(_emergency(code, str(position), None, about))
     for fault in GatewayError:
         code, detail = fault.value
         byte4 = None if fault is GatewayError.HEARTBEAT_LOST else detail

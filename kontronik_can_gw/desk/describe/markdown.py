@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
+from operator import itemgetter
 from textwrap import indent, wrap
 from typing import Any, NamedTuple
 
@@ -36,25 +37,36 @@ def markdown(title: str, lead: Iterable[str], tables: Iterable[Table]) -> str:
 
     Columns that are empty in all rows of a table are left out.
     """
-    blocks = [f"# {text(title)}", *map(_wrapped, lead)]
+    blocks = [f"# {text(title)}"]
+    blocks += map(_wrapped, lead)
     for table in tables:
         blocks.append(f"## {text(table.title)}")
         for paragraph in table.text:
-            is_code = isinstance(paragraph, Code)
-            blocks.append(indent(paragraph, "    ") if is_code else _wrapped(paragraph))
+            if isinstance(paragraph, Code):
+                blocks.append(indent(paragraph, "    "))
+            else:
+                blocks.append(_wrapped(paragraph))
         if table.by:
-            for head, rows in groupby(table.rows, key=lambda row: row[table.by]):
-                blocks += [f"### {text(str(head))}", _render_rows(list(rows), table.by)]
+            for head, rows in groupby(table.rows, key=itemgetter(table.by)):
+                blocks.append(f"### {text(str(head))}")
+                blocks.append(_render_rows(list(rows), table.by))
         elif table.rows:
             blocks.append(_render_rows(table.rows))
     return "\n\n".join(filter(None, blocks)) + "\n"
 
 
 def _render_rows(rows: Sequence[Row], without: str = "") -> str:
-    cells = [{key: _cell(key, value) for key, value in row.items()} for row in rows]
-    keys = [key for key in rows[0] if key != without and any(row[key] for row in cells)]
-    lines = [[text(key.replace("_", " ")) for key in keys], ["---"] * len(keys)]
-    lines += [[row[key] for key in keys] for row in cells]
+    """Return the lines of a table: head, separator and rows.
+
+    The column ``without`` and empty columns are left out.
+    """
+    columns: dict[str, list[str]] = {}
+    for key in rows[0]:
+        cells = [_cell(key, row[key]) for row in rows]
+        if key != without and any(cells):
+            title = text(key.replace("_", " "))
+            columns[key] = [title, "---", *cells]
+    lines = zip(*columns.values(), strict=True)
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -68,16 +80,20 @@ def _cell(key: str, value: object) -> str:
     if value is True:
         return "yes"
     if isinstance(value, int):
-        is_large = abs(value) > 0xFFFFFF and key not in ("min", "max")
-        if is_large or key in _HEX:
-            return f"{value:0{_HEX.get(key, 1)}X}h"
+        digits = _HEX.get(key)
+        if digits is None and abs(value) > 0xFFFFFF and key not in ("min", "max"):
+            digits = 1
+        if digits is not None:
+            return f"{value:0{digits}X}h"
     if isinstance(value, float):
         return f"{value:.10g}"
+    content = str(value)
     if isinstance(value, Mapping):
-        return text(", ".join(f"{name} {word}" for name, word in value.items()))
-    if isinstance(value, list):
-        return text(", ".join(map(str, value)))
-    return text(str(value))
+        pairs = [f"{name} {word}" for name, word in value.items()]
+        content = ", ".join(pairs)
+    elif isinstance(value, list):
+        content = ", ".join(map(str, value))
+    return text(content)
 
 
 def _wrapped(paragraph: str) -> str:

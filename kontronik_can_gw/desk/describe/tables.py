@@ -6,7 +6,7 @@ A physical value is raw * factor + offset.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from fractions import Fraction
 from pathlib import PurePath
@@ -19,7 +19,7 @@ from kontronik_can_gw.config.keys import TABLES, shipped
 from kontronik_can_gw.dbc.prepare import is_mute, reporter
 from kontronik_can_gw.desk.describe.markdown import Row, Table
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol, State
+from kontronik_can_gw.esc.decoder import EscProtocol, State
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.esc.values import VALUES, Group
@@ -34,7 +34,11 @@ _AVAILABLE = {
     Group.LINK: "always",
     Group.GATEWAY: "always",
 }
-_SEND_TYPES = {SendType.CYCLIC: "cyclic", SendType.EVENT: "event", SendType.ON_CHANGE: "on change"}
+_SEND_TYPES = {
+    SendType.CYCLIC: "cyclic",
+    SendType.EVENT: "event",
+    SendType.ON_CHANGE: "on change",
+}
 
 
 # --- configuration
@@ -50,15 +54,16 @@ def configuration() -> list[Table]:
 
 
 def _keys(table: Any) -> list[Row]:
-    return [
-        {
+    rows = []
+    for key in fields(table):
+        row = {
             "key": key.name,
             "range": key.metadata["kind"].span,
             "default": _default(key),
             "meaning": key.metadata["doc"],
         }
-        for key in fields(table)
-    ]
+        rows.append(row)
+    return rows
 
 
 def _default(key: Field[Any]) -> object:
@@ -78,18 +83,22 @@ def _default(key: Field[Any]) -> object:
 
 def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[Table]:
     """Return tables of the messages that the gateway sends, and of their signals."""
+    layout = bus.layout
     copies = bus.copies()
-    comment = next((each.comment for each in bus.database.buses if each.comment), "")
-    file = f"{PurePath(bus.layout.file).name}, messages of {bus.layout.node}."
+    comments = [each.comment for each in bus.database.buses if each.comment]
+    comment = comments[0] if comments else ""
+    file = f"{PurePath(layout.file).name}, messages of {layout.node}."
     messages: list[Row] = []
     signals: list[Row] = []
-    for plan in bus.layout.messages:
+    for plan in layout.messages:
         copy = copies[plan.name]
         messages.append(_message(plan, copy.message))
         signal_of_file = {name: signal for signal, name in copy.signals()}
         for signal in plan.signals:
-            row = _signal(plan, signal, signal_of_file[signal.name], escs)
-            signals.append({"message": plan.name, **row})
+            original = signal_of_file[signal.name]
+            row: Row = {"message": plan.name}
+            row |= _signal(plan, signal, original, escs)
+            signals.append(row)
     return [
         Table("Messages", [file, _line(comment)], messages),
         Table("Signals", [_SIGNALS], signals, by="message"),
@@ -104,6 +113,8 @@ _SIGNALS = (
 
 def _message(plan: MessagePlan, message: Any) -> Row:
     """Return the row of a message. Without cycle or minimum time, these cells are None."""
+    cycle_ms = Fraction(plan.cycle_ns, MS)
+    delay_ms = Fraction(plan.delay_ns, MS)
     return {
         "name": plan.name,
         "id": plan.can_id,
@@ -111,31 +122,41 @@ def _message(plan: MessagePlan, message: Any) -> Row:
         "fd": plan.fd,
         "bytes": plan.length,
         "sent": [word for flag, word in _SEND_TYPES.items() if flag in plan.send_type],
-        "cycle_ms": number(Fraction(plan.cycle_ns, MS)) or None,
-        "delay_ms": number(Fraction(plan.delay_ns, MS)) or None,
+        "cycle_ms": number(cycle_ms) or None,
+        "delay_ms": number(delay_ms) or None,
         "meaning": _line(message.comment),
     }
 
 
 def _signal(
-    message: MessagePlan, plan: SignalPlan, signal: Any, escs: Sequence[EscSettings]
+    message: MessagePlan,
+    plan: SignalPlan,
+    signal: Any,
+    escs: Sequence[EscSettings],
 ) -> Row:
     """Return the row of a signal.
 
     ``min`` and ``max`` are the DBC's, or else the limits of the values that can be sent. ``shows``
     is the name of the value, or the role of the bits.
     """
-    is_flag = plan.length == 1 and not plan.signed and plan.factor == 1 and plan.offset == 0
+    is_flag = _is_flag(plan)
     not_available: int | None = plan.not_available
     error: int | None = plan.error
     if plan.role is not Role.SOURCE or (is_flag and plan.numbers is None):
         not_available = None
         error = None
-    limits = plan.limits if plan.is_float else (plan.low, plan.high)
-    low, high = sorted(float(raw * plan.factor + plan.offset) for raw in limits)
-    choices = {int(value): str(word) for value, word in (signal.choices or {}).items()}
-    codes = (not_available, error)
-    has_esc = plan.esc is not None and len(escs) > 1
+    low, high = _sent_limits(plan)
+    names = {}
+    for value, word in sorted((signal.choices or {}).items()):
+        if value not in (not_available, error):
+            names[int(value)] = str(word)
+    esc = None
+    if plan.esc is not None and len(escs) > 1:
+        esc = escs[plan.esc].name
+    shows = plan.role.value
+    if plan.source is not None:
+        shows = plan.source.name
+    sentences = [_line(signal.comment), *_notes(message, plan)]
     return {
         "signal": plan.name,
         "start": signal.start,
@@ -150,11 +171,24 @@ def _signal(
         "unit": plan.unit,
         "not_available": not_available,
         "error": error,
-        "shows": plan.role.value if plan.source is None else plan.source.name,
-        "esc": escs[plan.esc or 0].name if has_esc else None,
-        "meaning": " ".join(filter(None, [_line(signal.comment), *_notes(message, plan)])),
-        "names": {value: choices[value] for value in sorted(choices) if value not in codes},
+        "shows": shows,
+        "esc": esc,
+        "meaning": " ".join(filter(None, sentences)),
+        "names": names,
     }
+
+
+def _is_flag(plan: SignalPlan) -> bool:
+    is_bit = plan.length == 1 and not plan.signed
+    return is_bit and plan.factor == 1 and plan.offset == 0
+
+
+def _sent_limits(plan: SignalPlan) -> list[float]:
+    """Return the least and the greatest physical value that can be sent."""
+    limits: Sequence[float | Fraction] = (plan.low, plan.high)
+    if plan.is_float:
+        limits = plan.limits
+    return sorted(float(raw * plan.factor + plan.offset) for raw in limits)
 
 
 def _number_type(plan: SignalPlan) -> str:
@@ -186,7 +220,8 @@ def held(signal: SignalPlan) -> str:
         text = signal.texts.get(signal.constant)
         if text:
             return text
-    return f"{raw * float(signal.factor) + float(signal.offset):.10g} {signal.unit}".rstrip()
+    value = raw * float(signal.factor) + float(signal.offset)
+    return f"{value:.10g} {signal.unit}".rstrip()
 
 
 def _finite(value: float) -> float | None:
@@ -203,30 +238,50 @@ class Text(NamedTuple):
     remedy: str = "Nothing to do."
 
 
-# fmt: off
 LINK_STATES: Mapping[LinkState, Text] = {
     LinkState.NEVER_SEEN: Text(
         "nothing was received since the start",
-        "Switch the ESC on. Check the cable and the telemetry setting of the ESC. A KOSMIK sends after one throttle pulse."),
+        "Switch the ESC on. Check the cable and the telemetry setting of the ESC. "
+        "A KOSMIK sends after one throttle pulse.",
+    ),
     LinkState.SEARCHING: Text(
         "bytes are received, but no valid frame yet",
-        "If this persists: the ESC may be set to another protocol, or the line is disturbed. The log and decode show the probable cause."),
+        "If this persists: the ESC may be set to another protocol, or the line is disturbed. "
+        "The log and decode show the probable cause.",
+    ),
     LinkState.OK: Text("valid frames are received"),
-    LinkState.DEGRADED: Text("valid frames are received, with many CRC errors or dropped bytes", GatewayError.CRC_RATE.remedy),
-    LinkState.LOST: Text("valid frames were received earlier, but none now", GatewayError.TELEMETRY_LOST.remedy),
-    LinkState.PORT_ERROR: Text("the serial port cannot be opened or read", GatewayError.PORT_GONE.remedy),
+    LinkState.DEGRADED: Text(
+        "valid frames are received, with many CRC errors or dropped bytes",
+        GatewayError.CRC_RATE.remedy,
+    ),
+    LinkState.LOST: Text(
+        "valid frames were received earlier, but none now",
+        GatewayError.TELEMETRY_LOST.remedy,
+    ),
+    LinkState.PORT_ERROR: Text(
+        "the serial port cannot be opened or read",
+        GatewayError.PORT_GONE.remedy,
+    ),
 }
 CAN_STATES: Mapping[CanState, Text] = {
     CanState.UNKNOWN: Text("the CAN interface does not report it"),
     CanState.ERROR_ACTIVE: Text("works without errors"),
-    CanState.ERROR_WARNING: Text("works, but there are errors on the bus", GatewayError.CAN_PASSIVE.remedy),
-    CanState.ERROR_PASSIVE: Text("works, with many errors on the bus", GatewayError.CAN_PASSIVE.remedy),
+    CanState.ERROR_WARNING: Text(
+        "works, but there are errors on the bus",
+        GatewayError.CAN_PASSIVE.remedy,
+    ),
+    CanState.ERROR_PASSIVE: Text(
+        "works, with many errors on the bus",
+        GatewayError.CAN_PASSIVE.remedy,
+    ),
     CanState.BUS_OFF: Text(
         "switched off because of errors on the bus, so no frame can be sent",
-        f"{GatewayError.BUS_OFF_LEFT.remedy} With restart-ms 0, restart the interface by hand."),
+        f"{GatewayError.BUS_OFF_LEFT.remedy} With restart-ms 0, restart the interface by hand.",
+    ),
     CanState.DOWN: Text(
         "the CAN interface is down or missing, so no frame can be sent",
-        "Plug in the adapter, and set the interface up. kontronik-can-gw doctor shows the command."),
+        "Plug in the adapter, and set the interface up. kontronik-can-gw doctor shows the command.",
+    ),
 }
 GATEWAY_STATES: Mapping[GatewayState, Text] = {
     GatewayState.STARTING: Text("opening its ports and the CAN interface"),
@@ -234,16 +289,21 @@ GATEWAY_STATES: Mapping[GatewayState, Text] = {
     GatewayState.STOPPING: Text("shutting down"),
     GatewayState.REPLAY: Text("the values come from a recording, not from an ESC"),
 }
-# fmt: on
 
 
 def values(escs: Sequence[EscSettings]) -> list[Table]:
     """Return tables of every value that a signal or object can show, of errors, states, devices."""
     meanings = meanings_of(escs)
-    sources = [binding.source for binding in BINDINGS.values()]
-    only_objects = {source.name: source for source in sources if source.name not in VALUES}
+    only_objects = {}
+    objects_of: dict[str, list[str]] = {}
+    for key, binding in BINDINGS.items():
+        source = binding.source
+        objects_of.setdefault(source.name, []).append(place(*key))
+        if source.name not in VALUES:
+            only_objects[source.name] = source
     rows = []
     for name, value in {**VALUES, **only_objects}.items():
+        plain_name = name.replace("_", " ").capitalize()
         available = _AVAILABLE[value.group]
         if value.optional:
             available += ", if known"
@@ -252,26 +312,35 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
             "unit": value.unit,
             "available": available,
             "counter": value.rolls,
-            "objects": [place(*key) for key, each in BINDINGS.items() if each.source.name == name],
+            "objects": objects_of.get(name, []),
             "only_objects": name in only_objects,
-            "meaning": meanings.get(name, name.replace("_", " ").capitalize()),
+            "meaning": meanings.get(name, plain_name),
             "names": {int(number): text for number, text in value.names.items()},
         }
         rows.append(row)
     protocols = protocols_of(escs)
-    operating = [(n, state.text, state) for p in protocols for n, state in p.states.items()]
+    operating = []
+    devices = []
+    for protocol in protocols:
+        for code, state in protocol.states.items():
+            operating.append((code, state.text, state))
+        devices += [_device(protocol, device) for device in protocol.devices]
     return [
         Table("Values", _VALUES, rows),
         _errors("Operating errors", "Bits of each live frame.", protocols),
         _errors("Selftest errors", "Bits of the info frame, about once a second.", protocols),
         _states("Operating", operating),
-        Table("Devices", [], [_device(p, device) for p in protocols for device in p.devices]),
-        _states("Link", [(n, pascal_case(n.name), state) for n, state in LINK_STATES.items()]),
-        _states("CAN", [(n, pascal_case(n.name), state) for n, state in CAN_STATES.items()]),
-        _states(
-            "Gateway", [(n, pascal_case(n.name), state) for n, state in GATEWAY_STATES.items()]
-        ),
+        Table("Devices", [], devices),
+        _states("Link", _named(LINK_STATES)),
+        _states("CAN", _named(CAN_STATES)),
+        _states("Gateway", _named(GATEWAY_STATES)),
     ]
+
+
+def _named(states: Mapping[Any, Text]) -> Iterator[tuple[int, str, Text]]:
+    """Yield number, name and description of each state of the gateway."""
+    for state, text in states.items():
+        yield state, pascal_case(state.name), text
 
 
 _VALUES = (
@@ -296,31 +365,44 @@ def place(index: int, sub: int) -> str:
 
 def _errors(title: str, text: str, protocols: Sequence[EscProtocol]) -> Table:
     word = title.lower().replace(" ", "_")
-    rows = [
-        {"bit": int(bit), "name": bit.text, "severity": bit.severity.value, **_about(bit)}
-        for protocol in protocols
-        for bit in protocol.errors.get(word, ())
-    ]
+    rows = []
+    for protocol in protocols:
+        for bit in protocol.errors.get(word, ()):
+            row = {
+                "bit": int(bit),
+                "name": bit.text,
+                "severity": bit.severity.value,
+                "meaning": bit.meaning,
+                "remedy": bit.remedy,
+            }
+            rows.append(row)
     return Table(title, [text], rows)
 
 
 def _states(title: str, states: Iterable[tuple[int, str, Text | State]]) -> Table:
-    rows = [{"value": int(n), "name": name, **_about(state)} for n, name, state in states]
+    rows = []
+    for value, name, state in states:
+        row = {
+            "value": int(value),
+            "name": name,
+            "meaning": state.meaning,
+            "remedy": state.remedy,
+        }
+        rows.append(row)
     return Table(f"{title} states", [], rows)
-
-
-def _about(of: Text | State | ErrorBit) -> Row:
-    return {"meaning": of.meaning, "remedy": of.remedy}
 
 
 def _device(protocol: EscProtocol, device: int) -> Row:
     """Return the row of a device. ``peak_current_of`` is None if it is unknown."""
-    live = [field for field in protocol.fields if not field.is_info]
+    not_supplied = []
+    for field in protocol.fields:
+        if not field.is_info and device in field.not_on:
+            not_supplied.append(field.name)
     return {
         "value": device,
         "name": protocol.devices[device],
         "peak_current_of": protocol.peak_current_of.get(device),
-        "not_supplied": [field.name for field in live if device in field.not_on],
+        "not_supplied": not_supplied,
     }
 
 
@@ -344,7 +426,8 @@ def meanings_of(escs: Sequence[EscSettings]) -> dict[str, str]:
                 comment = message.get_signal_by_name(signal.name).comment
                 found[signal.source.name] = _line(comment)
     for protocol in protocols_of(escs):
-        found |= {bit.text: bit.meaning for bit in protocol.bits.values()}
+        for bit in protocol.bits.values():
+            found[bit.text] = bit.meaning
     return found
 
 

@@ -86,7 +86,11 @@ def _link(machine: Machine, name: str) -> Mapping[str, Any]:
 
 
 def _controller(
-    findings: Findings, can: CanConfig, data: Mapping[str, Any], is_up: bool, has_restart: bool
+    findings: Findings,
+    can: CanConfig,
+    data: Mapping[str, Any],
+    is_up: bool,
+    has_restart: bool,
 ) -> None:
     """Report bit rates, recovery from bus-off, state and modes as the driver shows them."""
     # a driver with fixed rates, for example slcan, shows the bit rate without further timing

@@ -28,7 +28,11 @@ def diagnoses(document: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def check_port(
-    machine: Machine, esc: str, port: str, even_parity: bool, diagnosis: str = ""
+    machine: Machine,
+    esc: str,
+    port: str,
+    even_parity: bool,
+    diagnosis: str = "",
 ) -> list[Finding]:
     """Return all findings about the port of one ESC.
 
@@ -38,33 +42,52 @@ def check_port(
     real = machine.real(port)
     status = machine.status(port)
     tty = real.rpartition("/")[2]
-    findings = Findings(f"Serial port of {esc}", port=port, tty=tty, user=machine.user)
+    findings = Findings(
+        f"Serial port of {esc}",
+        port=port,
+        tty=tty,
+        user=machine.user,
+    )
     hardware = f"/sys/class/tty/{tty}"
     is_pty = real.startswith("/dev/pts/")
-    is_tty = status is not None and stat.S_ISCHR(status.st_mode)
-    if status is None or not is_tty or not (is_pty or machine.exists(hardware)):
+    if status is None or not _is_port(machine, status, hardware, is_pty):
         named = ", ".join(machine.names("/dev/serial/by-id"))
-        there = f". Available in /dev/serial/by-id: {named}" if named else ""
-        findings.say("port.exists", "no_port" if status else "none", there=there)
+        there = ""
+        if named:
+            there = f". Available in /dev/serial/by-id: {named}"
+        case = "no_port" if status else "none"
+        findings.say("port.exists", case, there=there)
         return findings.found
     usb = _adapter(machine, machine.real(f"{hardware}/device"))
-    product = machine.text(f"{usb}/product") if usb else ""
-    what = ", ".join(filter(None, [tty, product]))
-    findings.say("port.exists", "pty" if is_pty else "ok", what=what)
+    what = tty
+    if usb:
+        product = machine.text(f"{usb}/product")
+        what = ", ".join(filter(None, [tty, product]))
+    case = "pty" if is_pty else "ok"
+    findings.say("port.exists", case, what=what)
     if diagnosis:
         findings.say("port.telemetry", "none", diagnosis=diagnosis)
     case = _permission(machine, port, status)
-    findings.say("port.permission", case, group=machine.group_name(status.st_gid))
+    group = machine.group_name(status.st_gid)
+    findings.say("port.permission", case, group=group)
     _users(machine, findings, status, is_pty)
     if is_pty:
         return findings.found
     if usb and port.startswith("/dev/tty"):
         better = _stable_name(machine, real, usb)
-        findings.say("port.name", "unstable" if better else "no_udev", better=better)
+        case = "unstable" if better else "no_udev"
+        findings.say("port.name", case, better=better)
     _writers(machine, findings, tty, usb)
     if even_parity and is_mini_uart(f"/dev/{tty}", machine.root):
         findings.say("port.parity", "mini_uart")
     return findings.found
+
+
+def _is_port(machine: Machine, status: os.stat_result, hardware: str, is_pty: bool) -> bool:
+    """Return True for a pseudo terminal, and for a terminal with hardware."""
+    if not stat.S_ISCHR(status.st_mode):
+        return False
+    return is_pty or machine.exists(hardware)
 
 
 def _permission(machine: Machine, port: str, status: os.stat_result) -> str:
@@ -74,14 +97,18 @@ def _permission(machine: Machine, port: str, status: os.stat_result) -> str:
     if machine.runs_gateway:
         return "gateway"
     has_group_access = status.st_mode & 0o060 == 0o060
-    return "join" if has_group_access and status.st_gid != 0 else "open"
+    if has_group_access and status.st_gid != 0:
+        return "join"
+    return "open"
 
 
 def _adapter(machine: Machine, folder: str) -> str:
     """Return the folder of a tty's USB adapter. Empty if the tty is not a USB adapter."""
     while folder.count("/") > 2 and not machine.exists(f"{folder}/idVendor"):
         folder = folder.rpartition("/")[0]
-    return folder if folder.count("/") > 2 else ""
+    if folder.count("/") <= 2:
+        return ""
+    return folder
 
 
 def _stable_name(machine: Machine, real: str, usb: str) -> str:
@@ -117,26 +144,31 @@ def _users(machine: Machine, findings: Findings, status: os.stat_result, is_pty:
     for process in own:
         findings.say("port.users", "gateway", who=process)
     if others:
+        who = ", ".join(map(str, others))
         pids = " ".join(str(process.pid) for process in others)
-        findings.say("port.users", "others", who=", ".join(map(str, others)), pids=pids)
+        findings.say("port.users", "others", who=who, pids=pids)
     if not own and not others:
-        findings.say("port.users", "ok" if is_pty or machine.user == "root" else "unseen")
+        sees_all = is_pty or machine.user == "root"
+        findings.say("port.users", "ok" if sees_all else "unseen")
 
 
 def _writers(machine: Machine, findings: Findings, tty: str, usb: str) -> None:
     """Check that no console of the kernel, no login prompt and no service writes to the ESC."""
-    is_console = tty in machine.text("/sys/class/tty/console/active").split()
-    findings.say("port.console", "console" if is_console else "ok")
+    consoles = machine.text("/sys/class/tty/console/active").split()
+    case = "console" if tty in consoles else "ok"
+    findings.say("port.console", case)
     prompts = []
     for process in machine.processes:
         arguments = [word.rpartition("/")[2] for word in process.words[1:]]
         if "getty" in process.name and tty in arguments:
             prompts.append(str(process))
-    findings.say("port.getty", "getty" if prompts else "ok", who=", ".join(prompts))
+    case = "getty" if prompts else "ok"
+    findings.say("port.getty", case, who=", ".join(prompts))
     if not usb:
         return
     names = {process.name for process in machine.processes}
-    has_rules = any(machine.exists(f"{top}/{_RULES}") for top in ("/etc", "/usr/lib", "/lib"))
+    places = [f"{top}/{_RULES}" for top in ("/etc", "/usr/lib", "/lib")]
+    has_rules = any(map(machine.exists, places))
     if "ModemManager" in names and not has_rules:
         findings.say("port.modem_manager", "runs")
     if "brltty" in names:

@@ -80,7 +80,12 @@ def check_service(machine: Machine, findings: Findings, unit: Unit | None, confi
 
 
 def check_folder(
-    machine: Machine, findings: Findings, what: str, folder: str, own: bool, reserve: int
+    machine: Machine,
+    findings: Findings,
+    what: str,
+    folder: str,
+    own: bool,
+    reserve: int,
 ) -> None:
     """Check that a folder exists or can be created, is writable and has free space.
 

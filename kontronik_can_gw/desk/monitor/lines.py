@@ -4,6 +4,7 @@ import re
 import textwrap
 from collections.abc import Iterable, Sequence
 
+from rich.align import AlignMethod
 from rich.text import Text
 
 from kontronik_can_gw.desk.member import Alarm
@@ -11,13 +12,23 @@ from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.printable import printable
 
 STATES = {
-    **dict.fromkeys(("ok", "error-active", "running"), "green"),
-    **dict.fromkeys(("degraded", "error-warning", "error-passive"), "yellow"),
+    "ok": "green",
+    "error-active": "green",
+    "running": "green",
+    "degraded": "yellow",
+    "error-warning": "yellow",
+    "error-passive": "yellow",
     "unknown": "",
     "-": "dim",
 }
 """Styles of the states of a link, a CAN controller and a gateway. Other states are bad."""
-_KINDS = {Severity.ERROR: ("ERROR", "bold red"), Severity.WARNING: ("WARNING", "yellow")}
+_KINDS = {
+    Severity.ERROR: ("ERROR", "bold red"),
+    Severity.WARNING: ("WARNING", "yellow"),
+}
+"""Head and style of an alarm. Other alarms are notes."""
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W_]")
+"""An acronym, a word, a number, or a single character."""
 
 Part = str | tuple[str, str] | Text
 """Text without a style, text with a style of rich, or a finished part of a line."""
@@ -39,12 +50,20 @@ def line(*parts: Part) -> Text:
 
 def wrapped(text: str, style: str, width: int) -> list[Text]:
     """Return a text as lines of this width."""
-    parts = textwrap.wrap(text, max(20, width), subsequent_indent="    ", break_on_hyphens=False)
+    parts = textwrap.wrap(
+        text,
+        max(20, width),
+        subsequent_indent="    ",
+        break_on_hyphens=False,
+    )
     return [line((part, style)) for part in parts]
 
 
 def table(
-    rows: Sequence[Sequence[Part]], width: int, left: int, least: Sequence[int]
+    rows: Sequence[Sequence[Part]],
+    width: int,
+    left: int,
+    least: Sequence[int],
 ) -> list[Text]:
     """Return lines of aligned columns. Columns that do not fit are left out from the right.
 
@@ -52,16 +71,22 @@ def table(
     the columns of a live table keep their positions.
     """
     cells = [[line(part) for part in row] for row in rows]
+    columns = zip(*cells, strict=True)
     widths = []
-    for minimum, column in zip(least, zip(*cells, strict=True), strict=True):
-        widths.append(max(minimum, *(cell.cell_len for cell in column)))
-    while sum(widths) + len(widths) - 1 > width and len(widths) > 1:
+    for minimum, column in zip(least, columns, strict=True):
+        widest = max(cell.cell_len for cell in column)
+        widths.append(max(minimum, widest))
+    while len(widths) > 1:
+        spaces = len(widths) - 1
+        if sum(widths) + spaces <= width:
+            break
         widths.pop()
     lines = []
     for row in cells:
         shown = row[: len(widths)]
         for index, cell in enumerate(shown):
-            cell.align("left" if index < left else "right", widths[index])
+            side: AlignMethod = "left" if index < left else "right"
+            cell.align(side, widths[index])
         lines.append(line(Text(" ").join(shown)))
     return lines
 
@@ -87,8 +112,10 @@ def cut(lines: list[Text], room: int) -> list[Text]:
         return lines
     if room <= 0:
         return []
-    more = line((f"... and {len(lines) - room + 1} more lines: enlarge the terminal", "dim"))
-    return [*lines[: room - 1], more]
+    kept = lines[: room - 1]
+    omitted = len(lines) - len(kept)
+    kept.append(line((f"... and {omitted} more lines: enlarge the terminal", "dim")))
+    return kept
 
 
 def words(text: str) -> str:
@@ -97,9 +124,11 @@ def words(text: str) -> str:
     ``SpoolUpFromStill`` becomes ``spool up from still``, ``RpmControl`` becomes ``RPM control``.
     """
     parts = []
-    for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W_]", text):
+    for part in _WORD.findall(text):
         is_acronym = len(part) > 1 and part.isupper()
-        parts.append(part if is_acronym else part.lower())
+        if not is_acronym:
+            part = part.lower()
+        parts.append(part)
     return " ".join(parts).replace("rpm", "RPM")
 
 
@@ -110,9 +139,11 @@ def shorten(name: str, width: int) -> str:
     """
     if len(name) <= width:
         return name
-    tail = max(0, (width - 1) // 2)
-    head = max(0, width - 1 - tail)
-    return f"{name[:head]}…{name[len(name) - tail :]}"
+    kept = max(0, width - 1)
+    tail = kept // 2
+    begin = name[: kept - tail]
+    end = name[len(name) - tail :]
+    return f"{begin}…{end}"
 
 
 def number(value: float | None, digits: int = 0) -> str:

@@ -122,11 +122,11 @@ class Esc(Member):
     def units(self) -> dict[str, str]:
         """Unit of each source in the DBC, except flags and error words."""
         words = self.protocol.errors
-        return {
-            name: value.unit
-            for name, value in VALUES.items()
-            if name in self.no_flags and name not in words
-        }
+        found = {}
+        for name, value in VALUES.items():
+            if name in self.no_flags and name not in words:
+                found[name] = value.unit
+        return found
 
     def document(self) -> dict[str, Any]:
         """Return all data as JSON. Values that are not available are None."""
@@ -153,7 +153,8 @@ class Monitor:
         """Name of the DBC in use."""
         self.view = View(SignalReader(bus.layout))
         self.gateway = Member(self.view, None, None)
-        self.escs = tuple(Esc(self.view, each, index) for index, each in enumerate(bus.escs))
+        escs = [Esc(self.view, settings, index) for index, settings in enumerate(bus.escs)]
+        self.escs = tuple(escs)
         self.frame_rate: float | None = None
         """Frames of the layout in the last second. None during the first second."""
         self._start: int | None = None
@@ -179,14 +180,16 @@ class Monitor:
         if frame.remote:
             return
         now = self.advance(now)
-        for first, values in self.view.take(frame.key, frame.data, now) or ():
+        decoded = self.view.take(frame.key, frame.data, now)
+        for first, values in decoded or ():
             self._missing.discard(first)
             for column, raw in enumerate(values, first):
-                if column in self._tracked:
-                    esc, source = self._tracked[column]
-                    value = esc.converted(source, raw)
-                    if isinstance(value, (int, float)):
-                        esc.tracks[source].take(value)
+                if column not in self._tracked:
+                    continue
+                esc, source = self._tracked[column]
+                value = esc.converted(source, raw)
+                if isinstance(value, (int, float)):
+                    esc.tracks[source].take(value)
 
     def advance(self, now: int) -> int:
         """Set the time and expire the values of missing messages.

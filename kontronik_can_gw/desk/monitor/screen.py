@@ -41,7 +41,9 @@ _MARKS = {"": "bold", "!": "bold yellow", "!!": "bold red"}
 """Styles of marked values. The marks themselves are for displays without colour."""
 _NO_TELEMETRY = "no telemetry{since}: is the ESC powered and its cable plugged in?"
 _TROUBLES = {
-    "searching": "bytes but no telemetry: is it the right port? Does the ESC send {protocol} telemetry?",
+    "searching": (
+        "bytes but no telemetry: is it the right port? Does the ESC send {protocol} telemetry?"
+    ),
     "porterror": "the gateway cannot open the port: see its log, or kontronik-can-gw status",
 }
 _PAGE_WIDTHS = (16, 5, 8, 8, 8)
@@ -69,38 +71,55 @@ _MAX_CHART_LINES = 8
 
 
 def screen(
-    monitor: Monitor, source: Source, size: tuple[int, int], page: int, keys: bool = True
+    monitor: Monitor,
+    source: Source,
+    size: tuple[int, int],
+    page: int,
+    keys: bool = True,
 ) -> list[Text]:
     """Return the whole screen within ``size`` (columns, lines).
 
     ``page`` is the number of an ESC, or 0 for all ESCs. ``keys`` is True if keys are read.
     """
-    width = max(20, size[0])
-    height = max(4, size[1])
+    columns, rows = size
+    width = max(20, columns)
+    last = max(4, rows) - 1
+    """Index of the last line."""
     lines = [_title(monitor, source)]
     for text, style in notices(monitor, source):
         lines += wrapped(text, style, width)
-    room = height - len(lines) - 1
-    escs = monitor.escs if page == 0 else monitor.escs[page - 1 : page]
+    escs = monitor.escs
+    if page:
+        escs = escs[page - 1 : page]
+    room = last - len(lines) - 1  # an empty line is below the body
     if len(escs) == 1:
-        kept = len(alarms(escs, width, _ALARM_LINES))
-        # the heights of the charts must not depend on the number of errors, which changes
-        page_lines = _page(escs[0], width, room - 1 - _ALARM_LINES)
-        body = page_lines[: max(2, room - 1 - kept)]
+        lines += _page_body(escs[0], width, room)
     else:
-        kept = len(alarms(escs, width, _FEW_ALARM_LINES))
-        body = cut(table_of(escs, width), max(2, room - 1 - kept))
-        body += _histories(escs, width, room - 1 - _ALARM_LINES - len(body))
-    lines += body
+        lines += _table_body(escs, width, room)
     lines.append(line())
-    lines += alarms(escs, width, max(0, height - 1 - len(lines)))
-    while len(lines) < height - 1:
+    lines += alarms(escs, width, max(0, last - len(lines)))
+    while len(lines) < last:
         lines.append(line())
-    lines = lines[: height - 1]
+    lines = lines[:last]
     lines.append(_foot(len(monitor.escs), source, keys))
     for each in lines:
         each.truncate(width, overflow="ellipsis")
     return lines
+
+
+def _page_body(esc: Esc, width: int, room: int) -> list[Text]:
+    """Return the page of one ESC. The heights of its charts do not depend on its alarms."""
+    alarm_count = len(alarms([esc], width, _ALARM_LINES))
+    body = _page(esc, width, room - _ALARM_LINES)
+    return body[: max(2, room - alarm_count)]
+
+
+def _table_body(escs: Sequence[Esc], width: int, room: int) -> list[Text]:
+    """Return the table of all ESCs, and charts if there is room."""
+    alarm_count = len(alarms(escs, width, _FEW_ALARM_LINES))
+    body = cut(table_of(escs, width), max(2, room - alarm_count))
+    chart_room = room - _ALARM_LINES - len(body)
+    return body + _histories(escs, width, chart_room)
 
 
 def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, str]]:
@@ -128,29 +147,36 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, str]]:
 
 
 def _title(monitor: Monitor, source: Source) -> Text:
-    made = line((f" {source.name} ", "bold reverse"))
+    parts: list[Part] = [(f" {source.name} ", "bold reverse")]
     if source.simulation:
-        made.append(f"  {source.simulation}", "bold yellow")
+        parts.append((f"  {source.simulation}", "bold yellow"))
     elif source.is_file:
-        made.append(f"  {source.progress}", "dim")
+        parts.append((f"  {source.progress}", "dim"))
     else:
-        made.append(f"  {monitor.file}", "dim")
+        parts.append((f"  {monitor.file}", "dim"))
     state = monitor.gateway.text("gateway_state")
     if state is not None:
         name = words(state)
-        made = line(made, "  gateway ", (name, STATES.get(name, "yellow")))
+        style = STATES.get(name, "yellow")
+        parts.append("  gateway ")
+        parts.append((name, style))
     can_state = monitor.gateway.text("can_state") or "unknown"
     if normalize(can_state) not in ("unknown", "erroractive"):
-        made = line(made, (f"  CAN {words(can_state)}", "yellow"))
-    return line(made, f"  {number(monitor.frame_rate)} frames/s")
+        parts.append((f"  CAN {words(can_state)}", "yellow"))
+    parts.append(f"  {number(monitor.frame_rate)} frames/s")
+    return line(*parts)
 
 
 def _foot(count: int, source: Source, keys: bool) -> Text:
     if not keys:
         return line(("Ctrl-C ends", "dim"))
-    one = f"  1-{min(9, count)} n p one ESC  0 all" if count > 1 else ""
-    pause = "  space pause" if source.is_file else ""
-    return line((f"q quit{one}{pause}  r reset min/max", "dim"))
+    text = "q quit"
+    if count > 1:
+        text += f"  1-{min(9, count)} n p one ESC  0 all"
+    if source.is_file:
+        text += "  space pause"
+    text += "  r reset min/max"
+    return line((text, "dim"))
 
 
 def _link_part(esc: Esc) -> Part:
@@ -183,7 +209,9 @@ def _name_part(esc: Esc, width: int | None = None) -> Part:
         mark = "!!"
     elif Severity.WARNING in severities:
         mark = "!"
-    suffix = f" {mark}" if mark else ""
+    suffix = ""
+    if mark:
+        suffix = f" {mark}"
     name = esc.name
     if width is not None:
         name = shorten(name, width - len(suffix))
@@ -193,10 +221,11 @@ def _name_part(esc: Esc, width: int | None = None) -> Part:
 def _value_part(esc: Esc, quantity: Quantity) -> Part:
     """Return the present value, with a mark if it is beyond its limits."""
     value = esc.number(quantity.source)
+    text = number(value, quantity.digits)
     if value is None:
-        return number(value, quantity.digits), "dim"
+        return text, "dim"
     mark = quantity.mark(value)
-    return mark + number(value, quantity.digits), _MARKS[mark]
+    return mark + text, _MARKS[mark]
 
 
 def sparkline(esc: Esc, quantity: Quantity, width: int, height: int = 1) -> list[Text]:
@@ -205,23 +234,31 @@ def sparkline(esc: Esc, quantity: Quantity, width: int, height: int = 1) -> list
     It is scaled to the extremes of the value. It has ``height`` lines, the top one first.
     """
     track = esc.tracks[quantity.source]
-    values = list(track.history)[-width:] if width else []
+    values: list[float | None] = []
+    if width:
+        values = list(track.history)[-width:]
     scale = [value for value in (*values, track.low, track.high) if value is not None]
     low = min(scale, default=0.0)
-    span = max(scale, default=0.0) - low
+    high = max(scale, default=0.0)
+    span = high - low
     steps = len(_LEVELS) * height
     made = [line() for _ in range(height)]
     for value in values:
         filled = 0
         style = ""
         if value is not None:
-            part = (value - low) / span if 0 < span < inf else 0
+            part = 0.0
+            if 0 < span < inf:
+                part = (value - low) / span
             filled = 1 + round(part * (steps - 1))
-            style = _MARKS.get(quantity.mark(value) or "-", "cyan")
-        for index, each in enumerate(made):
-            level = filled - len(_LEVELS) * (height - 1 - index)
-            level = min(level, len(_LEVELS))
-            each.append(_LEVELS[level - 1] if level > 0 else " ", style)
+            mark = quantity.mark(value)
+            style = _MARKS[mark] if mark else "cyan"
+        for above, each in enumerate(reversed(made)):
+            level = filled - above * len(_LEVELS)
+            character = " "
+            if level > 0:
+                character = _LEVELS[min(level, len(_LEVELS)) - 1]
+            each.append(character, style)
     return made
 
 
@@ -246,18 +283,22 @@ def alarms(escs: Sequence[Esc], width: int, room: int = 999) -> list[Text]:
     """Return the errors and warnings of the ESCs."""
     found: list[tuple[str, Alarm]] = []
     for esc in escs:
-        prefix = f"{esc.name} " if len(escs) > 1 else ""
+        prefix = ""
+        if len(escs) > 1:
+            prefix = f"{esc.name} "
         flags = list(esc.active)
         trouble = _trouble(esc)
         if trouble:
             flags.insert(0, trouble)
-        found += [(prefix, flag) for flag in alarms_of(flags)]
+        for flag in alarms_of(flags):
+            found.append((prefix, flag))
     if found:
         return alarm_lines(found, width, room)
-    summary = ("errors: -", "dim")
+    if room <= 0:
+        return []
     if any(esc.state is not None for esc in escs):
-        summary = ("no errors, no warnings", "green")
-    return [line(summary)][:room]
+        return [line(("no errors, no warnings", "green"))]
+    return [line(("errors: -", "dim"))]
 
 
 def _page(esc: Esc, width: int, height: int) -> list[Text]:
@@ -265,11 +306,13 @@ def _page(esc: Esc, width: int, height: int) -> list[Text]:
 
     The charts use ``height`` lines if that is enough.
     """
-    seconds = max(0, min(HISTORY_S, width - sum(_PAGE_WIDTHS) - len(_PAGE_WIDTHS)))
+    room = width - sum(_PAGE_WIDTHS) - len(_PAGE_WIDTHS)
+    seconds = max(0, min(HISTORY_S, room))
+    head = _page_head(esc)
     heads = ("", "", "now", "min", "max", f"last {seconds} s")
     rows: list[list[Part]] = [[(text, "dim") for text in heads]]
     shown = [quantity for quantity in QUANTITIES if esc.has(quantity.source)]
-    heights = _chart_heights(len(shown), height - len(rows) - 2)
+    heights = _chart_heights(len(shown), height - len(head) - 1)
     for quantity, lines in zip(shown, heights, strict=True):
         track = esc.tracks[quantity.source]
         cells: list[Part] = [
@@ -282,23 +325,33 @@ def _page(esc: Esc, width: int, height: int) -> list[Text]:
         chart = sparkline(esc, quantity, seconds, lines)
         rows += _chart_rows(cells, chart)
     least = (*_PAGE_WIDTHS, seconds)
-    return [*_page_head(esc), *table(rows, width, 2, least)]
+    return head + table(rows, width, 2, least)
 
 
 def _page_head(esc: Esc) -> list[Text]:
     """Return two lines with state, link, device and counters of an ESC."""
-    head = line(_name_part(esc), "  ", _state_part(esc), "  link ", _link_part(esc))
-    age = esc.number("data_age")
-    if age is not None:
-        text = f"{age:.0f} ms" if age < 1000 else duration(round(age * MS))
+    head = line(
+        _name_part(esc),
+        "  ",
+        _state_part(esc),
+        "  link ",
+        _link_part(esc),
+    )
+    age_ms = esc.number("data_age")
+    if age_ms is not None:
+        text = f"{age_ms:.0f} ms"
+        if age_ms >= 1000:
+            text = duration(round(age_ms * MS))
         head.append(f", age {text}")
     about = esc.device_text or "-"
     cells = esc.number("cell_count")
     if cells:
         about += f", {cells:.0f} cells"
     if esc.has("crc_errors", "dropped_bytes"):
-        about += f"  CRC errors {number(esc.number('crc_errors'))}"
-        about += f", dropped bytes {number(esc.number('dropped_bytes'))}"
+        crc_errors = esc.number("crc_errors")
+        dropped_bytes = esc.number("dropped_bytes")
+        about += f"  CRC errors {number(crc_errors)}"
+        about += f", dropped bytes {number(dropped_bytes)}"
     return [head, line((about, "dim"))]
 
 
@@ -310,8 +363,11 @@ def _chart_heights(count: int, height: int) -> list[int]:
     each, more = divmod(height, max(1, count))
     heights = []
     for index in range(count):
-        lines = each + 1 if index < more else each
-        heights.append(max(1, min(_MAX_CHART_LINES, lines)))
+        lines = each
+        if index < more:
+            lines += 1
+        lines = min(lines, _MAX_CHART_LINES)
+        heights.append(max(1, lines))
     return heights
 
 
@@ -329,15 +385,19 @@ def _histories(escs: Sequence[Esc], width: int, height: int) -> list[Text]:
     Empty if they do not fit.
     """
     known = [each for each in _HISTORIES if _is_supplied(each, escs)]
-    shown = known[: max(0, height - 2) // max(1, len(escs))]
+    chart_lines = height - 2  # without the empty line and the head
+    count = max(0, chart_lines) // max(1, len(escs))
     charts: list[tuple[Quantity, Esc]] = []
-    for quantity in shown:
-        charts += [(quantity, esc) for esc in escs if esc.has(quantity.source)]
+    for quantity in known[:count]:
+        for esc in escs:
+            if esc.has(quantity.source):
+                charts.append((quantity, esc))
     names = max(len(esc.name) for esc in escs)
-    seconds = min(HISTORY_S, width - names - 1 - sum(_HISTORY_WIDTHS) - len(_HISTORY_WIDTHS))
+    widths = (names, *_HISTORY_WIDTHS)
+    seconds = min(HISTORY_S, width - sum(widths) - len(widths))
     if not charts or seconds <= 0:
         return []
-    lines = min(_chart_heights(len(charts), height - 2))
+    lines = min(_chart_heights(len(charts), chart_lines))
     heads = ("ESC", "", "", "now", f"last {seconds} s")
     rows: list[list[Part]] = [[(text, "dim") for text in heads]]
     for quantity, esc in charts:
@@ -349,7 +409,7 @@ def _histories(escs: Sequence[Esc], width: int, height: int) -> list[Text]:
         ]
         chart = sparkline(esc, quantity, seconds, lines)
         rows += _chart_rows(cells, chart)
-    least = (names, *_HISTORY_WIDTHS, seconds)
+    least = (*widths, seconds)
     return [line(), *table(rows, width, 3, least)]
 
 
@@ -362,26 +422,33 @@ def table_of(escs: Sequence[Esc], width: int) -> list[Text]:
     supplied = [quantity for quantity in QUANTITIES if _is_supplied(quantity, escs)]
     speeds = [quantity for quantity in supplied if quantity.unit == "1/min"]
     shown = speeds[:1]
-    shown += [quantity for quantity in supplied if quantity.head and quantity not in speeds]
-    kept = 0
+    for quantity in supplied:
+        if quantity.head and quantity not in speeds:
+            shown.append(quantity)
+    columns: list[list[Part]] = []
     for quantity in shown:
-        if quantity in speeds or QUANTITIES.index(quantity) <= _LAST_KEPT:
-            kept += 1
-    values: list[list[Part]] = [[(each.head or each.unit, "dim") for each in shown]]
-    for esc in escs:
-        values.append([_value_part(esc, quantity) for quantity in shown])
+        head = quantity.head or quantity.unit
+        column: list[Part] = [(head, "dim")]
+        column += [_value_part(esc, quantity) for esc in escs]
+        columns.append(column)
     links = [_link_part(esc) for esc in escs]
     room = width - _widest(links, _LINK_WIDTH) - 2
-    for column in range(kept):
-        room -= _widest([row[column] for row in values], _VALUE_WIDTH) + 1
+    for quantity, column in zip(shown, columns, strict=True):
+        if quantity in speeds or QUANTITIES.index(quantity) <= _LAST_KEPT:
+            room -= _widest(column, _VALUE_WIDTH) + 1
     name_width, state_width = _name_and_state_widths(escs, room)
-    head: list[Part] = [("ESC", "dim"), ("link", "dim"), ("state", "dim")]
-    rows = [head + values[0]]
-    for esc, link, cells in zip(escs, links, values[1:], strict=True):
+    names: list[Part] = [("ESC", "dim")]
+    states: list[Part] = [("state", "dim")]
+    for esc in escs:
+        names.append(_name_part(esc, name_width))
         state = line(_state_part(esc))
         state.truncate(state_width, overflow="ellipsis")
-        rows.append([_name_part(esc, name_width), link, state, *cells])
-    least = (_NAME_WIDTH, _LINK_WIDTH, state_width, *[_VALUE_WIDTH] * len(shown))
+        states.append(state)
+    head_of_links: Part = ("link", "dim")
+    columns = [names, [head_of_links, *links], states, *columns]
+    rows = list(zip(*columns, strict=True))
+    least = [_NAME_WIDTH, _LINK_WIDTH, state_width]
+    least += [_VALUE_WIDTH] * len(shown)
     return table(rows, width, 3, least)
 
 

@@ -56,15 +56,26 @@ def _live(console: Console, source: Source, monitor: Monitor, stopped: Stopped) 
                 due = max(due + REFRESH_S, now + REFRESH_S / 2)
             source.pump(monitor.take, min(due, now + 0.1))
             monitor.advance(source.now())
-            if fd is not None and select.select([fd], [], [], 0)[0]:
-                typed = b""
-                with contextlib.suppress(OSError):
-                    typed = os.read(fd, 64)
-                key = typed.decode("ascii", "ignore").lower()
-                if not typed or key in _QUIT:  # no byte: the terminal is closed
-                    return
-                page = obey(key, source, monitor, page)
-                due = now
+            key = None if fd is None else _typed(fd)
+            if key is None:
+                continue
+            if key in _QUIT:
+                return
+            page = obey(key, source, monitor, page)
+            due = now
+
+
+def _typed(fd: int) -> str | None:
+    """Return the typed keys, or a key that quits if the terminal is closed. None without a key."""
+    readable, _, _ = select.select([fd], [], [], 0)
+    if not readable:
+        return None
+    typed = b""
+    with contextlib.suppress(OSError):
+        typed = os.read(fd, 64)
+    if not typed:
+        return _QUIT[0]
+    return typed.decode("ascii", "ignore").lower()
 
 
 def obey(key: str, source: Source, monitor: Monitor, page: int) -> int:
@@ -104,8 +115,9 @@ def _keys() -> Iterator[int | None]:
         yield None
         return
     before = termios.tcgetattr(fd)
-    single = before[3] & ~(termios.ECHO | termios.ICANON | termios.ISIG)
-    termios.tcsetattr(fd, termios.TCSADRAIN, [*before[:3], single, *before[4:]])
+    mode = list(before)
+    mode[3] &= ~(termios.ECHO | termios.ICANON | termios.ISIG)
+    termios.tcsetattr(fd, termios.TCSADRAIN, mode)
     try:
         yield fd
     finally:
@@ -153,7 +165,10 @@ def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> 
 
 
 def stream(
-    source: Source, monitor: Monitor, write: Callable[[dict[str, Any]], None], stopped: Stopped
+    source: Source,
+    monitor: Monitor,
+    write: Callable[[dict[str, Any]], None],
+    stopped: Stopped,
 ) -> None:
     """Write a document for each second of the source's clock, and one at the end of a file.
 
@@ -192,9 +207,10 @@ def _document(source: Source, monitor: Monitor, now: int) -> dict[str, Any]:
     if wall is not None:
         wall -= source.now() - now
         moment = datetime.fromtimestamp(wall / SECOND, UTC).astimezone()
-    return {
-        "time": None if moment is None else moment.isoformat(timespec="milliseconds"),
-        "file" if source.is_file else "interface": source.name,
-        "dbc": monitor.file,
-        **monitor.document(),
-    }
+    document: dict[str, Any] = {"time": None}
+    if moment is not None:
+        document["time"] = moment.isoformat(timespec="milliseconds")
+    kind = "file" if source.is_file else "interface"
+    document[kind] = source.name
+    document["dbc"] = monitor.file
+    return document | monitor.document()

@@ -214,7 +214,12 @@ class MqttClient:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 15)
 
     def _on_connect(
-        self, _client: object, _data: object, _flags: object, reason: Any, *_: object
+        self,
+        _client: object,
+        _data: object,
+        _flags: object,
+        reason: Any,
+        *_: object,
     ) -> None:
         self._has_answered = True
         if reason.is_failure:

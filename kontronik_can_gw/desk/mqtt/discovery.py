@@ -37,8 +37,14 @@ _NOT_DIAGNOSTIC = {"energy_used", "motor_run_time", "link_state"}
 """Values of these groups that are shown with the measured values nevertheless."""
 _UPPER = {"bec", "pwm", "crc", "can", "id", "esc", "eeprom"}
 """Words that are written in capitals."""
-_LEFT_OUT = {"operating_state_raw", "device_raw", "operating_errors", "selftest_errors"}
-_LEFT_OUT |= {"firmware_main", "firmware_sub"}
+_LEFT_OUT = {
+    "operating_state_raw",
+    "device_raw",
+    "operating_errors",
+    "selftest_errors",
+    "firmware_main",
+    "firmware_sub",
+}
 """Sources without an entity, because another entity shows the same."""
 _MOTOR: dict[str, Any] = {
     "platform": "sensor",
@@ -56,9 +62,16 @@ _ERROR_ENTITIES: dict[str, dict[str, Any]] = {
         "platform": "binary_sensor",
         "name": "Problem",
         "device_class": "problem",
-        "value_template": "{% if value_json.problem is none %}None{% elif value_json.problem %}ON{% else %}OFF{% endif %}",
+        "value_template": (
+            "{% if value_json.problem is none %}None"
+            "{% elif value_json.problem %}ON{% else %}OFF{% endif %}"
+        ),
     },
-    "errors": {"platform": "sensor", "name": "Errors", "value_template": _NAMES.format("errors")},
+    "errors": {
+        "platform": "sensor",
+        "name": "Errors",
+        "value_template": _NAMES.format("errors"),
+    },
     "selftest": {
         "platform": "sensor",
         "name": "Self-test",
@@ -72,11 +85,14 @@ def device(topics: Topics, member: Published) -> dict[str, Any]:
     """Return the discovery payload of the gateway or an ESC: one device with all its entities."""
     identifier = topics.identifier(member.name)
     online = {"topic": topics.of("online")}
+    gateway_available = {"topic": topics.of("available")}
+    member_available = {"topic": topics.of(member.name, "available")}
     components: dict[str, dict[str, Any]] = {}
     for source in member.no_flags:
         if source not in _LEFT_OUT:
             components[source] = entity(source, member)
-    if member.index is not None and member.has(*member.protocol.bits, *member.protocol.errors):
+    protocol = member.protocol
+    if member.index is not None and member.has(*protocol.bits, *protocol.errors):
         components |= _ERROR_ENTITIES
     if member.has("operating_state", "operating_state_raw"):
         components["motor"] = _MOTOR
@@ -85,13 +101,15 @@ def device(topics: Topics, member: Published) -> dict[str, Any]:
         if key in VALUES and VALUES[key].group is Group.LINK:
             # Values of the link stay valid while the ESC sends nothing, and are most useful then.
             components[key] |= {
-                "availability": [online, {"topic": topics.of("available")}],
+                "availability": [online, gateway_available],
                 "availability_mode": "all",
             }
+    about = {"identifiers": [identifier]}
+    about |= _about(topics, member)
     return {
-        "device": {"identifiers": [identifier], **_about(topics, member)},
+        "device": about,
         "origin": {"name": PROGRAM, "sw_version": __version__},
-        "availability": [online, {"topic": topics.of(member.name, "available")}],
+        "availability": [online, member_available],
         "availability_mode": "all",
         "state_topic": topics.of(member.name, "state"),
         "components": components,
@@ -125,8 +143,10 @@ def entity(source: str, member: Published) -> dict[str, Any]:
     if value.group in _DIAGNOSTIC and source not in _NOT_DIAGNOSTIC:
         found["entity_category"] = "diagnostic"
     if column.texts:
-        options = list(dict.fromkeys(text for _, text in column.texts))
-        return found | {"device_class": "enum", "options": options}
+        texts = [text for _, text in column.texts]
+        found["device_class"] = "enum"
+        found["options"] = list(dict.fromkeys(texts))
+        return found
     if value.names:  # an enumeration that the DBC sends as a number without texts
         return found
     default_class = "total_increasing" if value.rolls else "measurement"
@@ -141,6 +161,12 @@ def entity(source: str, member: Published) -> dict[str, Any]:
 
 
 def _display_name(source: str) -> str:
-    words = [word.upper() if word in _UPPER else word for word in source.split("_")]
-    text = " ".join("ESCs" if word == "escs" else word for word in words)
+    words = []
+    for word in source.split("_"):
+        if word in _UPPER:
+            word = word.upper()
+        elif word == "escs":
+            word = "ESCs"
+        words.append(word)
+    text = " ".join(words)
     return text[0].upper() + text[1:]

@@ -15,6 +15,7 @@ at most every 0.2 s.
 """
 
 import json
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -53,11 +54,17 @@ class Publisher:
         self._topics = topics
         self._config = config
         self._view = View(SignalReader(bus.layout))
-        columns = self._view.reader.columns
-        indices = sorted({column.esc for column in columns if column.esc is not None})
+        indices = set()
+        for column in self._view.reader.columns:
+            if column.esc is not None:
+                indices.add(column.esc)
         self._members = [Published(self._view, None, None)]
-        self._members += [Published(self._view, bus.escs[index], index) for index in indices]
-        self._member_of_sign = {at: member for member in self._members for at in member.signs}
+        for index in sorted(indices):
+            self._members.append(Published(self._view, bus.escs[index], index))
+        self._member_of_sign: dict[int, Published] = {}
+        """The member whose telemetry a value in a column proves."""
+        for member in self._members:
+            self._member_of_sign |= dict.fromkeys(member.signs, member)
         self._lasting: dict[str, bytes] = {}
         """The last payload of each topic with lasting messages."""
 
@@ -68,10 +75,12 @@ class Publisher:
 
     def take(self, frame: CanFrame, now: int) -> None:
         """Decode a received frame. Frames that the layout does not contain are ignored."""
-        for first, values in self._view.take(frame.key, frame.data, now) or ():
+        decoded = self._view.take(frame.key, frame.data, now)
+        for first, values in decoded or ():
             for at, value in enumerate(values, first):
-                if value is not None and at in self._member_of_sign:
-                    self._member_of_sign[at].heard_ns = now
+                member = self._member_of_sign.get(at)
+                if value is not None and member is not None:
+                    member.heard_ns = now
 
     def messages(self, now: int, wall_ns: int) -> list[Publication]:
         """Return the messages to publish now. Call it several times a second."""
@@ -81,19 +90,30 @@ class Publisher:
         for member in self._members:
             if not member.is_due(now, period_ns):
                 continue
-            for topic, payload in self._lasting_of(member, now).items():
-                if self._lasting.get(topic) != payload:
-                    found.append(Publication(topic, payload, lasting=True, retain=True))
-                    self._lasting[topic] = payload
-            topic = self._topics.of(member.name, "state")
-            state = {"time": iso(wall_ns)} | member.document(now)
-            found.append(Publication(topic, _json(state), retain=self._config.retain))
+            found += self._changed(self._lasting_of(member, now))
+            state = {"time": iso(wall_ns)}
+            state |= member.document(now)
+            publication = Publication(
+                self._topics.of(member.name, "state"),
+                _json(state),
+                retain=self._config.retain,
+            )
+            found.append(publication)
         return found
+
+    def _changed(self, payloads: dict[str, bytes]) -> Iterator[Publication]:
+        """Yield the lasting messages whose payload differs from the last one of their topic."""
+        for topic, payload in payloads.items():
+            if self._lasting.get(topic) != payload:
+                self._lasting[topic] = payload
+                yield Publication(topic, payload, lasting=True, retain=True)
 
     def _lasting_of(self, member: Published, now: int) -> dict[str, bytes]:
         """Return availability, and discovery if it has changed, as payloads by topic."""
-        available = ONLINE if member.is_available(now) else OFFLINE
-        found = {self._topics.of(member.name, "available"): available}
+        topic = self._topics.of(member.name, "available")
+        found = {topic: OFFLINE}
+        if member.is_available(now):
+            found[topic] = ONLINE
         prefix = self._config.discovery
         if prefix is not None and member.update_identity():
             topic = self._topics.discovery(prefix, member.name)
@@ -107,5 +127,7 @@ def _json(content: dict[str, Any]) -> bytes:
 
 def iso(wall_ns: int) -> str:
     """Return a Unix time as ISO 8601 in UTC, with milliseconds."""
-    moment = datetime.fromtimestamp(wall_ns // MS / 1000, UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    seconds = wall_ns // MS / 1000
+    moment = datetime.fromtimestamp(seconds, UTC)
+    text = moment.isoformat(timespec="milliseconds")
+    return text.replace("+00:00", "Z")

@@ -27,7 +27,8 @@ class Published(Member):
 
     def __init__(self, view: View, settings: EscSettings | None, index: int | None) -> None:
         super().__init__(view, settings, index)
-        self.signs = self.of_group[Group.LIVE] or [*self.no_flags.values()]
+        all_values = list(self.no_flags.values())
+        self.signs = self.of_group[Group.LIVE] or all_values
         """Columns whose values prove that telemetry is received.
 
         They are the live values, or all values if the DBC has no live ones.
@@ -36,8 +37,10 @@ class Published(Member):
         """Time of the newest value in these columns."""
         self.identity: tuple[str | None, str | None] | None = None
         """Device and firmware of the published discovery."""
-        self._kinds = {normalize(each.text): each.kind for each in self.protocol.states.values()}
+        self._kinds: dict[str, str | None] = {}
         """Kind of each operating state by its name."""
+        for state in self.protocol.states.values():
+            self._kinds[normalize(state.text)] = state.kind
         self._due: int | None = None
         """Time of the next state at the fixed rate. None before the first call of ``is_due``."""
         self._published_notable: tuple[object, ...] | None = None
@@ -86,10 +89,16 @@ class Published(Member):
 
     def document(self, now: int) -> dict[str, Any]:
         """Return the content of the state: all values, and their age in ms."""
-        heard_ns = self.view.last_ns if self.index is None else self.heard_ns
-        found: dict[str, Any] = {"available": self.is_available(now), "age": None}
+        heard_ns = self.heard_ns
+        if self.index is None:
+            heard_ns = self.view.last_ns
+        age_ms = None
         if heard_ns is not None:
-            found["age"] = (now - heard_ns) // MS
+            age_ms = (now - heard_ns) // MS
+        found: dict[str, Any] = {
+            "available": self.is_available(now),
+            "age": age_ms,
+        }
         values = {source: self.value(source) for source in self.no_flags}
         if self.index is None:
             return found | values
@@ -98,10 +107,13 @@ class Published(Member):
         found["errors"] = _describe(errors)
         found["problem"] = None
         if errors is not None:
-            found["problem"] = any(error.severity is Severity.ERROR for error in errors)
+            severities = {error.severity for error in errors}
+            found["problem"] = Severity.ERROR in severities
         found["selftest"] = _describe(self.flags("selftest_errors"))
         found["link_state"] = None  # present even if the DBC has no signal for it
-        return found | values | {"firmware": self.firmware}
+        found |= values
+        found["firmware"] = self.firmware
+        return found
 
     def update_identity(self) -> bool:
         """Update device and firmware. Returns True if the discovery must be published with them.
@@ -112,8 +124,13 @@ class Published(Member):
         if self.index is not None and self.heard_ns is None:
             return False
         before = self.identity
-        device, firmware = before or (None, None)
-        self.identity = (self.device or device, self.firmware or firmware)
+        device = self.device
+        firmware = self.firmware
+        if before is not None:
+            known_device, known_firmware = before
+            device = device or known_device
+            firmware = firmware or known_firmware
+        self.identity = (device, firmware)
         return self.identity != before
 
     def _kind_of_state(self) -> str | None:
@@ -123,7 +140,12 @@ class Published(Member):
 def _describe(flags: Sequence[Alarm] | None) -> list[dict[str, str]] | None:
     if flags is None:
         return None
-    return [
-        {"name": flag.text, "severity": flag.severity.value, "meaning": flag.meaning}
-        for flag in flags
-    ]
+    found = []
+    for flag in flags:
+        entry = {
+            "name": flag.text,
+            "severity": flag.severity.value,
+            "meaning": flag.meaning,
+        }
+        found.append(entry)
+    return found

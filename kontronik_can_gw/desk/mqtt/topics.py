@@ -12,7 +12,8 @@ class Topics:
 
     def of(self, *levels: str) -> str:
         """Return a topic of this gateway. Empty levels are left out."""
-        return "/".join(filter(None, (self.prefix, self.gateway, *levels)))
+        path = (self.prefix, self.gateway, *levels)
+        return "/".join(filter(None, path))
 
     def discovery(self, prefix: str, esc: str = "") -> str:
         """Return the topic of a device's discovery below Home Assistant's ``prefix``."""
@@ -20,4 +21,5 @@ class Topics:
 
     def identifier(self, esc: str = "") -> str:
         """Return Home Assistant's identifier of a device. It depends on the two names only."""
-        return "_".join(filter(None, ("kontronik", self.gateway, esc)))
+        words = ("kontronik", self.gateway, esc)
+        return "_".join(filter(None, words))

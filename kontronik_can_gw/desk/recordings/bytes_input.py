@@ -44,7 +44,10 @@ class BytesInput(PlayedInput):
     """The bytes of one ESC, without times."""
 
     def __init__(
-        self, path: Path, layout: BusLayout | None = None, stream: Stream | None = None
+        self,
+        path: Path,
+        layout: BusLayout | None = None,
+        stream: Stream | None = None,
     ) -> None:
         layout = layout or layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
         if len(layout.escs) != 1:

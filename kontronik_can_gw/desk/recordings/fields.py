@@ -119,7 +119,10 @@ def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
 
 
 def _fields_of_group(
-    values: Iterable[EscValue], group: Group, prefix: str, esc: int | None
+    values: Iterable[EscValue],
+    group: Group,
+    prefix: str,
+    esc: int | None,
 ) -> list[Field]:
     return [
         _field(value, prefix, esc)

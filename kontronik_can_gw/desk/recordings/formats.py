@@ -13,7 +13,11 @@ UART_MAGIC = b"KOD"
 
 
 def format_of(
-    head: bytes, name: str, *, is_capture: bool = False, diagnosis: str | None = None
+    head: bytes,
+    name: str,
+    *,
+    is_capture: bool = False,
+    diagnosis: str | None = None,
 ) -> str:
     """Return the format of a recording with this head. Raises UserError if it is no recording.
 

@@ -1,5 +1,6 @@
 """The DBC that describes a gateway's frames, and the ESCs whose values they contain."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -69,7 +70,10 @@ def shown_by(layout: BusLayout, known: Sequence[EscSettings]) -> BusLayout:
 
 
 def _compile_layout(
-    database: "Database", node: str, file: str, known: Sequence[EscSettings]
+    database: "Database",
+    node: str,
+    file: str,
+    known: Sequence[EscSettings],
 ) -> BusLayout:
     from kontronik_can_gw.dbc.prepare import prepare
 
@@ -90,20 +94,24 @@ def esc_names(database: "Database", node: str) -> list[str]:
 
     They have the order of the messages. Empty for a DBC of one ESC.
     """
-    groups = {normalize(name): value.group for name, value in VALUES.items()}
-    known = [name for name, group in groups.items() if group is not Group.GATEWAY]
-    counts: dict[str, int] = {}
+    all_values = set()
+    values_of_escs = set()
+    for name, value in VALUES.items():
+        all_values.add(normalize(name))
+        if value.group is not Group.GATEWAY:
+            values_of_escs.add(normalize(name))
+    counts: Counter[str] = Counter()
     for message in database.messages:
         if node not in message.senders:
             continue
         for signal in message.signals:
             key = normalize(signal.name).removesuffix("percent")
-            if key in groups:
+            if key in all_values:
                 continue
-            endings = [name for name in known if key.endswith(name)]
+            endings = [name for name in values_of_escs if key.endswith(name)]
             ending = max(endings, key=len, default="")
             name = signal.name.removesuffix("Percent")
             prefix = name[: len(name) - len(ending)].rstrip("_")
             if ending and prefix:
-                counts[prefix] = counts.get(prefix, 0) + 1
+                counts[prefix] += 1
     return [name for name, count in counts.items() if count > 1]

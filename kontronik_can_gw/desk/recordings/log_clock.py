@@ -92,7 +92,8 @@ class LogClock:
 
         A pipe may not have them yet, so a frame in its order must not need them.
         """
-        self._ahead.extend(islice(self._source, max(0, count - len(self._ahead))))
+        missing = max(0, count - len(self._ahead))
+        self._ahead.extend(islice(self._source, missing))
         return list(islice(self._ahead, count))
 
     def _is_alone(self, first: LogFrame) -> bool:
@@ -123,7 +124,9 @@ class LogClock:
         if len(following) < _STEP_FRAMES - 1:
             return None
         limit_ns = last - _DISORDER_NS - self._shift_ns
-        return following if all(one.time_ns < limit_ns for one in following) else None
+        if max(one.time_ns for one in following) >= limit_ns:
+            return None
+        return following
 
     def _set_back(self, item: LogFrame, following: Sequence[LogFrame], last: int) -> int:
         """Record a step before ``item``. Return the time at which the spacing continues."""
@@ -144,14 +147,15 @@ class LogClock:
             if name in guesses:
                 continue
             earlier = (seen.time_ns for seen in reversed(self._recent) if _name(seen) == name)
-            times = [*islice(earlier, 2)]
+            times = list(islice(earlier, 2))
             if len(times) == 2:
                 last_ns, before_ns = times
                 due_ns = 2 * last_ns - before_ns
                 guesses[name] = due_ns - (one.time_ns - item.time_ns)
         if not guesses:
             return last
-        return sorted(guesses.values())[(len(guesses) - 1) // 2]
+        ordered = sorted(guesses.values())
+        return ordered[(len(ordered) - 1) // 2]
 
 
 def _name(item: LogFrame) -> object:

@@ -84,7 +84,11 @@ class CanLogInput(Input):
     """
 
     def __init__(
-        self, path: Path, layout: BusLayout, format_: str, stream: Stream | None = None
+        self,
+        path: Path,
+        layout: BusLayout,
+        format_: str,
+        stream: Stream | None = None,
     ) -> None:
         super().__init__(str(path), layout)
         self._path = path

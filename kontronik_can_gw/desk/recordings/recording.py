@@ -85,7 +85,10 @@ class Block:
     """
 
     def __init__(
-        self, times: Sequence[int], columns: Sequence[Sequence[Any]], wall_ns: int | None
+        self,
+        times: Sequence[int],
+        columns: Sequence[Sequence[Any]],
+        wall_ns: int | None,
     ) -> None:
         self.times = times
         self.wall_ns = wall_ns
@@ -344,7 +347,9 @@ def between(items: Any, low_ns: int, high_ns: int) -> Any:
 
 
 def part_of(
-    items: Iterable[Any], start_ns: int | None, end_ns: int | None
+    items: Iterable[Any],
+    start_ns: int | None,
+    end_ns: int | None,
 ) -> tuple[int, Iterator[Any]] | None:
     """Return the part of a recording between two times after its beginning, both included.
 

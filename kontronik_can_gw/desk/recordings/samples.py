@@ -20,7 +20,7 @@ from kontronik_can_gw.desk.recordings.fields import Field, Kind, Read, distinct
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, LogFrame, Sample
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group
-from kontronik_can_gw.esc.values import Kind as How
+from kontronik_can_gw.esc.values import Kind as ValueKind
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import MessagePlan, SendType
@@ -71,8 +71,10 @@ class RowMaker(Output):
         self._ages: list[tuple[int, int, Read]] = []
         """ESC, index and function of each value that changes with time alone."""
         for index, field in enumerate(fields):
-            self._readers.setdefault(field.esc, []).append((index, field.reader))
-            if field.value and field.value.kind is How.AGE and field.esc is not None:
+            readers = self._readers.setdefault(field.esc, [])
+            readers.append((index, field.reader))
+            is_age = field.value is not None and field.value.kind is ValueKind.AGE
+            if is_age and field.esc is not None:
                 self._ages.append((field.esc, index, field.reader))
 
     def take_rows(self) -> Sequence[Sample]:
@@ -91,14 +93,17 @@ class RowMaker(Output):
         if not events & (Event.LIVE | Event.LINK | Event.INFO):
             return
         state = self._escs[esc]
-        row_ns = self._row_ns
+        is_live = bool(events & Event.LIVE)
         when = now
-        if events & Event.LIVE and state.live is not None and state.live_ns is not None:
+        if is_live and state.live is not None and state.live_ns is not None:
             when = min(now, state.live_ns)  # arrival of the frame's last byte
         # the times of rows never decrease
-        when = max(when, self._last_ns if row_ns is None else row_ns)
-        if row_ns is not None:
-            has_frame = events & Event.LIVE and esc in self._in_row
+        row_ns = self._row_ns
+        if row_ns is None:
+            when = max(when, self._last_ns)
+        else:
+            when = max(when, row_ns)
+            has_frame = is_live and esc in self._in_row
             if has_frame or when - row_ns > SAME_ROW_NS:
                 self._close_row()
         values = self._values
@@ -111,14 +116,15 @@ class RowMaker(Output):
             self._gateway_ns = when
             for index, read in self._readers.get(None, ()):
                 values[index] = read(None, status, when)
-        if events & Event.LIVE:
+        if is_live:
             self._in_row.add(esc)
             if self._row_ns is None:
                 self._row_ns = when
 
     def _close_row(self) -> None:
         if self._row_ns is not None:
-            self._rows.append(Sample(self._row_ns, tuple(self._values)))
+            row = Sample(self._row_ns, tuple(self._values))
+            self._rows.append(row)
             self._last_ns = self._row_ns
             self._row_ns = None
             self._in_row.clear()
@@ -305,11 +311,12 @@ class RowsOfFrames:
                 continue
             frames = [bits for _, bits in changes]
             begins = [row for row, _ in changes]
-            lengths = [end - begin for begin, end in pairwise((*begins, len(times)))]
+            edges = (*begins, len(times))
+            lengths = [end - begin for begin, end in pairwise(edges)]
             changes.clear()
             is_dense = 2 * len(frames) > len(times)
             if is_dense:  # one value for each row is faster than many short runs
-                frames = [*chain.from_iterable(map(repeat, frames, lengths))]
+                frames = list(chain.from_iterable(map(repeat, frames, lengths)))
             fresh = [bits for bits in frames if bits is not None]
             unpacker = self._reader.parts[part].unpacker
             for place, at, slope, shift in wanted:
@@ -317,17 +324,21 @@ class RowsOfFrames:
                 if (slope, shift) != (1, 0):
                     values = [_converted(value, slope, shift) for value in values]
                 if len(fresh) < len(frames):
-                    each = iter(values)
-                    values = [None if bits is None else next(each) for bits in frames]
+                    values = _with_gaps(values, frames)
                 if not is_dense:
                     values = _runs(values, lengths)
-                before = begins[0]
-                if before:
-                    columns[place] = [held[place]] * before + values
-                else:
-                    columns[place] = values
-                held[place] = values[-1]
+                last = values[-1]
+                if begins[0]:
+                    values = [held[place]] * begins[0] + values
+                columns[place] = values
+                held[place] = last
         return times, columns
+
+
+def _with_gaps(values: Sequence[Value], frames: Sequence[int | None]) -> list[Value]:
+    """Return the values with None at the place of each expiry in ``frames``."""
+    remaining = iter(values)
+    return [None if bits is None else next(remaining) for bits in frames]
 
 
 def _runs(values: Sequence[Value], lengths: Sequence[int]) -> list[Value]:

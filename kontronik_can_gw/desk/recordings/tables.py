@@ -138,11 +138,11 @@ class TextTable:
                 self._file.write(piece)
 
     def _write(self, block: Block) -> None:
-        heads = map(self._head_of_line, block.times, repeat(block.wall_ns or 0))
-        cells = [
-            map(texts.__getitem__, column)
-            for texts, column in zip(self._texts, block.columns, strict=True)
-        ]
+        wall_ns = block.wall_ns or 0
+        heads = map(self._head_of_line, block.times, repeat(wall_ns))
+        cells = []
+        for texts, column in zip(self._texts, block.columns, strict=True):
+            cells.append(map(texts.__getitem__, column))
         lines = map("".join, zip(heads, *cells, repeat(self._end)))
         self._file.write("".join(lines).encode())
 
@@ -161,17 +161,21 @@ class TextTable:
         if isinstance(value, str):
             return self._text(value)
         # a float signal may be infinite, but JSON has no infinite numbers
-        is_missing = value is None or not math.isfinite(value)
-        return self._nothing if is_missing else str(value)
+        if value is None or not math.isfinite(value):
+            return self._nothing
+        return str(value)
 
     @cached_property
     def _lines(self) -> "Lines":
         """Makes the same lines in C."""
         from kontronik_can_gw.native.offline import Lines, Style
 
+        utc = None
+        if self._table.has_utc:
+            utc = self._utc.encode()
         style = Style(
             self._start.encode(),
-            self._utc.encode() if self._table.has_utc else None,
+            utc,
             self._utc_end.encode(),
             self._end.encode(),
             self._nothing.encode(),
@@ -180,7 +184,9 @@ class TextTable:
         for prefix, one in zip(self._prefixes, self._table.fields, strict=True):
             texts = None
             if one.kind is Kind.TEXT:
-                texts = [(number, self._text(text).encode()) for number, text in one.texts]
+                texts = []
+                for number, text in one.texts:
+                    texts.append((number, self._text(text).encode()))
             cells.append((prefix.encode(), texts))
         return Lines(load.library()[0], style, cells)
 
@@ -206,25 +212,23 @@ class ParquetTable:
         self._pa: Any = pa
         self._compute: Any = compute
         self._table = table
-        self._texts = [
-            (
-                pa.array([number for number, _ in one.texts], pa.int64()),
-                pa.array([text for _, text in one.texts], pa.string()),
-            )
-            for one in table.fields
-        ]
-        """Numbers and texts of each column of texts."""
+        self._texts = []
+        """Numbers and texts of each column. Empty for a column without texts."""
+        for one in table.fields:
+            numbers = [number for number, _ in one.texts]
+            texts = [text for _, text in one.texts]
+            pair = (pa.array(numbers, pa.int64()), pa.array(texts, pa.string()))
+            self._texts.append(pair)
         heads = [pa.field(f"{TIME} [s]", pa.float64(), metadata={"unit": "s"})]
         if table.has_utc:
             heads.append(pa.field(UTC, pa.timestamp("ns", tz="UTC")))
-        heads += [
-            pa.field(
-                one.header,
-                self._type(one),
-                metadata={"signal": one.name, "unit": one.unit, "message": one.message},
-            )
-            for one in table.fields
-        ]
+        for one in table.fields:
+            about = {
+                "signal": one.name,
+                "unit": one.unit,
+                "message": one.message,
+            }
+            heads.append(pa.field(one.header, self._type(one), metadata=about))
         provenance = json.dumps(dict(table.provenance), ensure_ascii=False)
         self._schema = pa.schema(heads, metadata={"kontronik_can_gw": provenance})
         # a dictionary costs more than it saves if all values differ, or if a value takes one byte
@@ -251,8 +255,9 @@ class ParquetTable:
             times = pa.Array.from_buffers(pa.int64(), len(block), buffers)
         else:
             times = pa.array(block.times, pa.int64())
-        since = compute.subtract(times, self._table.origin_ns).cast(pa.float64(), safe=False)
-        arrays = [compute.divide(since, float(SECOND))]
+        elapsed_ns = compute.subtract(times, self._table.origin_ns)
+        elapsed_ns = elapsed_ns.cast(pa.float64(), safe=False)
+        arrays = [compute.divide(elapsed_ns, float(SECOND))]
         if self._table.has_utc:
             wall = compute.add(times, wall_ns)
             arrays.append(wall.cast(pa.timestamp("ns", tz="UTC")))
@@ -262,7 +267,8 @@ class ParquetTable:
             else:
                 array = pa.array(block.columns[index], self._type(one))
             arrays.append(array)
-        self._batches.append(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+        batch = pa.RecordBatch.from_arrays(arrays, schema=self._schema)
+        self._batches.append(batch)
         self._held += len(block)
         if self._held >= GROUP:
             self._write_group()
@@ -281,15 +287,20 @@ class ParquetTable:
         """Return a column of the C core without copying it."""
         pa = self._pa
         made = block.made
-        kind = pa.float64() if made.is_real[index] else pa.int64()
-        buffers = [pa.py_buffer(made.valid[index]), pa.py_buffer(made.values(index))]
-        found = pa.Array.from_buffers(kind, block.end, buffers)[block.begin :]
+        kind = pa.int64()
+        if made.is_real[index]:
+            kind = pa.float64()
+        valid = pa.py_buffer(made.valid[index])
+        values = pa.py_buffer(made.values(index))
+        found = pa.Array.from_buffers(kind, block.end, [valid, values])
+        found = found[block.begin :]
         if one.kind is Kind.FLAG:
             return found.cast(pa.int8(), safe=False)
         if one.kind is not Kind.TEXT:
             return found
         numbers, texts = self._texts[index]
-        return texts.take(self._compute.index_in(found, numbers)).dictionary_encode()
+        places = self._compute.index_in(found, numbers)
+        return texts.take(places).dictionary_encode()
 
     def _write_group(self) -> None:
         if self._batches:
@@ -306,4 +317,6 @@ class ParquetTable:
             return pa.int8()
         if one.kind is Kind.FLOAT:
             return pa.float64()
-        return pa.uint64() if _MAX_INT64 <= one.high <= 2 * _MAX_INT64 else pa.int64()
+        if _MAX_INT64 <= one.high <= 2 * _MAX_INT64:
+            return pa.uint64()
+        return pa.int64()

@@ -4,13 +4,12 @@ A value is valid until the next row. Nothing is counted while telemetry is lost.
 recording's clock.
 """
 
-import itertools
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import compress, repeat
 from math import isfinite
-from operator import ne
+from operator import attrgetter, ne
 from typing import Any, Literal, NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import Field, Kind
@@ -23,6 +22,7 @@ from kontronik_can_gw.desk.report.quantities import (
     PHASES,
     SPEEDS,
 )
+from kontronik_can_gw.esc.decoder import State
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
@@ -33,7 +33,13 @@ REST_CURRENT = 1.0
 """A. The battery is at rest up to this magnitude."""
 LOAD_CURRENT = 5.0
 """A. The battery is under load at or above this current."""
-LIVE = ("battery_voltage", *SPEEDS, "battery_current", "operating_state_raw", "operating_state")
+LIVE = (
+    "battery_voltage",
+    *SPEEDS,
+    "battery_current",
+    "operating_state_raw",
+    "operating_state",
+)
 """The first of these in the recording shows whether telemetry is present."""
 DEVICE = ("device", "device_raw", "variant", "firmware_main", "firmware_sub")
 _WORD_BITS = 32
@@ -98,21 +104,40 @@ class Events:
         ``lost``: the cause is a loss of telemetry, so the condition itself may continue.
         """
         event = self._open.pop(key, None)
-        if event is not None:
-            event.end_ns = time_ns
-            event.note = "until telemetry was lost" if lost else ""
+        if event is None:
+            return
+        event.end_ns = time_ns
+        if lost:
+            event.note = "until telemetry was lost"
 
     def in_order(self) -> list[Event]:
         """Return all events, sorted by their begin."""
-        every = itertools.chain.from_iterable(self._kept.values())
-        return sorted(every, key=lambda event: (event.begin_ns, event.esc))
+        found: list[Event] = []
+        for events in self._kept.values():
+            found += events
+        return sorted(found, key=attrgetter("begin_ns", "esc"))
+
+
+class _ErrorColumn(NamedTuple):
+    """A column with an error word or a flag."""
+
+    source: str
+    word: str
+    bits: Iterable[int]
+    """Bits of the word that the column contains."""
+    shift: int
+    """Left shift that turns the column's value into the word's."""
 
 
 class EscFlight:
     """The results of one ESC. A number is None if the recording does not have it."""
 
     def __init__(
-        self, index: int, settings: EscSettings, fields: Sequence[Field], events: Events
+        self,
+        index: int,
+        settings: EscSettings,
+        fields: Sequence[Field],
+        events: Events,
     ) -> None:
         self.name = settings.name
         self.telemetry_ns = 0
@@ -135,20 +160,26 @@ class EscFlight:
         self._events = events
         self._protocol = protocol_named(settings.protocol)
         self._columns = _first_fields(fields, index)
-        self.computed = _values_to_compute([fields[place] for place in self._columns.values()])
+        """Index of the field of each source."""
+        own_fields = [fields[place] for place in self._columns.values()]
+        self.computed = _values_to_compute(own_fields)
         """Values that the recording has less often than the values from which they follow."""
-        self._floats = {
-            field.source for field in fields if field.signal and field.kind is Kind.FLOAT
-        }
+        self._floats: set[str] = set()
         """Values in CAN frames that may be infinite, which means not available."""
-        self._live = next((source for source in LIVE if source in self._columns), None)
+        for field in fields:
+            if field.signal and field.kind is Kind.FLOAT:
+                self._floats.add(field.source)
+        live = [source for source in LIVE if source in self._columns]
+        self._live = live[0] if live else None
         self._words = self._error_words()
         known = self._known_sources()
         self.drawn = [source for source in DRAWN if source in known]
         self.has_errors = bool(self._words)
         self.has_power = "battery_power" in known
         self.has_speed = not known.isdisjoint(SPEEDS)
-        self._names = {normalize(state.text): state for state in self._protocol.states.values()}
+        self._state_of_name: dict[str, State] = {}
+        for state in self._protocol.states.values():
+            self._state_of_name[normalize(state.text)] = state
         self._last: dict[str, Any] = {"gap": True}
         """The last value of each column whose changes are followed."""
         self._counts: dict[str, float] = {}
@@ -162,33 +193,30 @@ class EscFlight:
     @property
     def energy_wh(self) -> float | None:
         """The integral of the positive power in Wh."""
-        return self._energy / HOUR_NS if self.has_power else None
+        if not self.has_power:
+            return None
+        return self._energy / HOUR_NS
 
     def take(
         self, times: Sequence[int], chunk: Sequence[Sequence[Any]]
     ) -> list[Sequence[int | float | None]]:
         """Evaluate rows that are given as columns. Return the columns to draw."""
-        columns = {source: chunk[place] for source, place in self._columns.items()}
+        columns: Columns = {}
+        for source, place in self._columns.items():
+            columns[source] = chunk[place]
         for source in columns.keys() & self._floats:
             columns[source] = _finite(columns[source])
         self._derive(columns)
-        nothing = (None,) * len(times)
-        present = nothing if self._live is None else columns[self._live]
+        present: Sequence[Any] = (None,) * len(times)
+        if self._live is not None:
+            present = columns[self._live]
         self._find_gaps(times, present)
-        parts = [columns.get(source, nothing) for source in DEVICE]
-        devices = [*zip(*parts, strict=True)]
-        for row, about in self._changes("device", devices):
-            self._name_device(times[row], *about)
+        self._find_devices(times, columns)
         states = columns.get(_state_of(columns), ())
         for row, state in self._changes("state", states):
             self._change_state(times[row], state)
-        for source, word, bits, shift in self._words:
-            for row, value in self._changes(source, columns[source]):
-                is_lost = value is None or present[row] is None
-                word_value = int(value or 0) << shift
-                for bit in bits:
-                    is_set = word_value >> bit & 1
-                    self._change_bit(times[row], word, bit, is_set, is_lost)
+        for error_column in self._words:
+            self._find_errors(times, present, columns, error_column)
         self._count(columns)
         self._find_extremes(times, columns)
         self._add_up(times, present, columns)
@@ -203,19 +231,20 @@ class EscFlight:
                 known.add("battery_power")
         return known
 
-    def _error_words(self) -> list[tuple[str, str, Iterable[int], int]]:
-        """Return the columns with errors: source, error word, bits, and left shift of the value.
+    def _error_words(self) -> list[_ErrorColumn]:
+        """Return the columns with errors.
 
         A column is a whole error word, or a flag if the recording does not have the word.
         """
-        found: list[tuple[str, str, Iterable[int], int]] = []
+        found = []
         for word, bits in self._protocol.errors.items():
             if word in self._columns:
-                found.append((word, word, range(_WORD_BITS), 0))
+                found.append(_ErrorColumn(word, word, range(_WORD_BITS), 0))
                 continue
             for bit in bits:
                 if bit.text in self._columns:
-                    found.append((bit.text, word, (int(bit),), int(bit)))
+                    column = _ErrorColumn(bit.text, word, (int(bit),), int(bit))
+                    found.append(column)
         return found
 
     def _changes(self, key: str, values: Sequence[Any]) -> Iterator[tuple[int, Any]]:
@@ -258,14 +287,37 @@ class EscFlight:
 
     # --- events
 
+    def _find_devices(self, times: Sequence[int], columns: Columns) -> None:
+        nothing = (None,) * len(times)
+        parts = [columns.get(source, nothing) for source in DEVICE]
+        devices = list(zip(*parts, strict=True))
+        for row, about in self._changes("device", devices):
+            self._name_device(times[row], *about)
+
+    def _find_errors(
+        self,
+        times: Sequence[int],
+        present: Sequence[Any],
+        columns: Columns,
+        column: _ErrorColumn,
+    ) -> None:
+        for row, value in self._changes(column.source, columns[column.source]):
+            is_lost = value is None or present[row] is None
+            word_value = int(value or 0) << column.shift
+            for bit in column.bits:
+                is_set = word_value >> bit & 1
+                self._change_bit(times[row], column.word, bit, is_set, is_lost)
+
     def _find_gaps(self, times: Sequence[int], present: Sequence[Any]) -> None:
         """Begin and end the events of lost telemetry."""
         key = (self._index, "gap")
-        for row, is_lost in self._changes("gap", [value is None for value in present]):
-            self._events.end(key, times[row])
+        missing = [value is None for value in present]
+        for row, is_lost in self._changes("gap", missing):
+            now = times[row]
+            self._events.end(key, now)
             if is_lost:
                 self.gaps += 1
-                event = Event("link", self._index, times[row], "No telemetry", "warning")
+                event = Event("link", self._index, now, "No telemetry", "warning")
                 self._events.begin(key, event)
 
     def _name_device(self, now: int, device: Any, raw: Any, variant: Any, *version: Any) -> None:
@@ -273,16 +325,20 @@ class EscFlight:
             device = self._protocol.devices.get(int(raw), f"device {raw}")
         if device is None:
             return
-        text = str(device) if variant is None else f"{device} {variant}"
+        text = str(device)
+        if variant is not None:
+            text += f" {variant}"
         if None not in version:
             text += ", firmware {}.{}".format(*version)
-        if text not in self.devices[-1:]:
-            if self.devices:
-                key = (self._index, "device")
-                change = f"Device changed from {self.devices[-1]} to {text}"
-                self._events.begin(key, Event("device", self._index, now, change))
-                self._events.end(key, now)
-            self.devices.append(text)
+        if text in self.devices[-1:]:
+            return
+        if self.devices:
+            key = (self._index, "device")
+            change = f"Device changed from {self.devices[-1]} to {text}"
+            event = Event("device", self._index, now, change)
+            self._events.begin(key, event)
+            self._events.end(key, now)
+        self.devices.append(text)
 
     def _change_state(self, now: int, value: Any) -> None:
         key = (self._index, "state")
@@ -290,7 +346,7 @@ class EscFlight:
         if value is None:
             return
         if isinstance(value, str):
-            state = self._names.get(normalize(value))
+            state = self._state_of_name.get(normalize(value))
         else:
             state = self._protocol.states.get(value)
         phase = PHASES[-1]
@@ -299,27 +355,32 @@ class EscFlight:
             text = state.text
             if state.phase in PHASES:
                 phase = state.phase
-        severity = "error" if phase == "Fault" else "status"
-        event = Event("state", self._index, now, text, severity, phase=PHASES.index(phase))
+        event = Event("state", self._index, now, text, phase=PHASES.index(phase))
+        if phase == "Fault":
+            event.severity = "error"
         self._events.begin(key, event)
 
     def _change_bit(self, now: int, word: str, bit: int, is_set: int, is_lost: bool) -> None:
         key = (self._index, word, bit)
-        if not is_set and key in self._set:
+        was_set = key in self._set
+        if was_set and not is_set:
             self._set.remove(key)
             self._events.end(key, now, lost=is_lost)
-        elif is_set and key not in self._set:
-            event = Event("error", self._index, now, f"unknown bit {bit}", "error")
-            known = next((one for one in self._protocol.errors[word] if one == bit), None)
-            if known is not None:
-                if known.is_normal:
-                    return
-                place = "self-test: " if word == "selftest_errors" else ""
-                event.text = place + known.meaning
-                event.severity = known.severity.value
-                event.remedy = known.remedy
-            self._set.add(key)
-            self._events.begin(key, event)
+        if was_set or not is_set:
+            return
+        event = Event("error", self._index, now, f"unknown bit {bit}", "error")
+        for known in self._protocol.errors[word]:
+            if known != bit:
+                continue
+            if known.is_normal:
+                return
+            event.text = known.meaning
+            if word == "selftest_errors":
+                event.text = f"self-test: {known.meaning}"
+            event.severity = known.severity.value
+            event.remedy = known.remedy
+        self._set.add(key)
+        self._events.begin(key, event)
 
     # --- numbers
 
@@ -332,17 +393,24 @@ class EscFlight:
             last = self._counts.get(source, known[0])
             increases = []
             # most values are equal to the one before, and are skipped
-            for value in compress(known, map(ne, known, (last, *known))):
-                increases.append(value - last if value >= last else value)
+            has_changed = map(ne, known, (last, *known))
+            for value in compress(known, has_changed):
+                increase = value
+                if value >= last:
+                    increase = value - last
+                increases.append(increase)
                 last = value
-            self.counted[source] = self.counted.get(source, 0) + sum(increases)
+            before = self.counted.get(source, 0)
+            self.counted[source] = before + sum(increases)
             self._counts[source] = last
 
     def _find_extremes(self, times: Sequence[int], columns: Columns) -> None:
         for quantities, best in ((MAXIMA, max), (MINIMA, min)):
             for source in quantities.keys() & columns.keys():
                 values = columns[source]
-                known = [v for v in values if v is not None] if None in values else values
+                known = values
+                if None in values:
+                    known = [value for value in values if value is not None]
                 if not known:
                     continue
                 value = best(known)
@@ -401,7 +469,9 @@ def _mean_cell(voltage: Number, cells: int | None, sent: Number) -> Number:
     """Return the mean cell voltage, or the sent value if the number of cells is unknown."""
     if voltage is None:
         return None
-    return round(voltage / cells, 3) if cells else sent
+    if not cells:
+        return sent
+    return round(voltage / cells, 3)
 
 
 def _power(voltage: Number, current: Number) -> Number:

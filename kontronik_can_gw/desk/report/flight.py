@@ -84,10 +84,12 @@ class Flight:
         window: tuple[float | None, float | None] = (None, None),
     ) -> None:
         low, high = window
-        self._from_ns = 0 if low is None else round(low * SECOND)
-        self._to_ns = None if high is None else round(high * SECOND)
-        timeouts = [settings.timeout_ns for settings in escs]
-        self._gap_ns = max(500 * MS, max(timeouts) + 250 * MS)
+        self._from_ns = round((low or 0) * SECOND)
+        self._to_ns: int | None = None
+        if high is not None:
+            self._to_ns = round(high * SECOND)
+        longest_timeout_ns = max(settings.timeout_ns for settings in escs)
+        self._gap_ns = max(500 * MS, longest_timeout_ns + 250 * MS)
         """Two rows further apart than this have a gap between them."""
         self._blank = ((None,),) * len(fields)
         self._gateway_state = column_of(fields, "gateway_state", None)
@@ -107,10 +109,12 @@ class Flight:
         """Time of the last row in the recording."""
         self.rows = 0
         self.replayed = False
-        self.escs = [EscFlight(i, each, fields, self.seen) for i, each in enumerate(escs)]
+        self.escs: list[EscFlight] = []
         self._drawn: list[tuple[int, str]] = []
         """ESC and source of each line."""
-        for index, esc in enumerate(self.escs):
+        for index, settings in enumerate(escs):
+            esc = EscFlight(index, settings, fields, self.seen)
+            self.escs.append(esc)
             self._drawn += [(index, source) for source in esc.drawn]
         self.points = Decimator(len(self._drawn), points)
         """Times and columns of all lines."""
@@ -131,15 +135,19 @@ class Flight:
             self.origin_ns = block.times[0]
             self._last_ns = block.times[0]
         block = self._without_long_gaps(block)
-        high = LATEST_NS if self._to_ns is None else self.origin_ns + self._to_ns
-        rows = block.between(self.origin_ns + self._from_ns, high)
+        low = self.origin_ns + self._from_ns
+        high = LATEST_NS
+        if self._to_ns is not None:
+            high = self.origin_ns + self._to_ns
+        rows = block.between(low, high)
         begin = 0
         for row, time_ns in enumerate(rows.times):
             if not self.rows and not row:
                 self.start_ns = time_ns
             elif time_ns - self.end_ns > self._gap_ns:
+                blank_row = Block([self.end_ns], self._blank, None)
                 self._analyse(rows.part(begin, row))
-                self._analyse(Block([self.end_ns], self._blank, None))
+                self._analyse(blank_row)
                 begin = row
             self.end_ns = time_ns
         self.rows += len(rows)
@@ -155,9 +163,11 @@ class Flight:
             return block
         moved = []
         for time_ns in times:
-            if time_ns - last_ns > LONGEST_GAP_NS:
-                length_ns = time_ns - last_ns - _GAP_LEFT_NS - self._gap_ns
-                self.cuts.append(Cut(last_ns - self._cut_ns, length_ns))
+            gap_ns = time_ns - last_ns
+            if gap_ns > LONGEST_GAP_NS:
+                begin_ns = last_ns - self._cut_ns
+                length_ns = gap_ns - _GAP_LEFT_NS - self._gap_ns
+                self.cuts.append(Cut(begin_ns, length_ns))
                 self._cut_ns += length_ns
             moved.append(time_ns - self._cut_ns)
             last_ns = time_ns
@@ -168,11 +178,13 @@ class Flight:
         for key, line in zip(self._drawn, self.points.columns, strict=True):
             if line.count(None) < len(line):
                 self.lines[key] = line
-        for slow, fast in pairwise(("output_speed", "motor_speed", "electrical_speed")):
-            if self._has_same_speeds(slow, fast):
-                for index, esc in enumerate(self.escs):
-                    self.lines.pop((index, slow), None)
-                    esc.extremes.pop(slow, None)
+        speeds = ("output_speed", "motor_speed", "electrical_speed")
+        for slow, fast in pairwise(speeds):
+            if not self._has_same_speeds(slow, fast):
+                continue
+            for index, esc in enumerate(self.escs):
+                self.lines.pop((index, slow), None)
+                esc.extremes.pop(slow, None)
         self.events = self.seen.in_order()
         return self
 
@@ -183,8 +195,9 @@ class Flight:
             if slow not in esc.extremes or fast not in esc.extremes:
                 continue
             has_both = True
-            top = esc.extremes[fast].value
-            if abs(esc.extremes[slow].value - top) > SAME_SPEED * top:
+            slow_top = esc.extremes[slow].value
+            fast_top = esc.extremes[fast].value
+            if abs(slow_top - fast_top) > SAME_SPEED * fast_top:
                 return False
         return has_both
 
@@ -194,8 +207,9 @@ class Flight:
         times = rows.times
         columns = rows.columns
         if self._gateway_state is not None:
-            for value in set(columns[self._gateway_state]):
-                self.replayed |= _is_replay(value)
+            states = set(columns[self._gateway_state])
+            if any(map(_is_replay, states)):
+                self.replayed = True
         drawn: list[Sequence[Number]] = []
         for esc in self.escs:
             drawn += esc.take(times, columns)
@@ -205,7 +219,9 @@ class Flight:
 def _is_replay(state: object) -> bool:
     """Return True for the gateway's state REPLAY, as a number or a text."""
     replay = GatewayState.REPLAY
-    return state == replay or normalize(str(state)) == normalize(replay.name)
+    if state == replay:
+        return True
+    return normalize(str(state)) == normalize(replay.name)
 
 
 # --- points to draw
@@ -282,11 +298,11 @@ def _append_extremes(points: list[Number], values: Sequence[Number], size: int) 
     """Add minimum and maximum of each ``size`` values. The last bucket may be shorter."""
     rest = len(values) % size
     whole = len(values) - rest
-    iterator = iter(values[:whole])
-    for bucket in zip(*[iterator] * size, strict=True):
-        points += _extremes_of(bucket)
+    for begin in range(0, whole, size):
+        points += _extremes_of(values[begin : begin + size])
     if rest:
-        points += _extremes_of(values[whole:])[:rest]
+        last = _extremes_of(values[whole:])
+        points += last[:rest]
 
 
 def _runs(columns: Sequence[Sequence[Number]], count: int) -> list[tuple[int, int]]:

@@ -48,7 +48,8 @@ def render(
     script = _file("page.js")
     policy = f"default-src 'none'; script-src {_hash(library)} {_hash(script)}; "
     policy += f"style-src {_hash(style)}; base-uri 'none'; form-action 'none'"
-    data = json.dumps(_data(flight, wall_ns), separators=(",", ":"), allow_nan=False)
+    content = _data(flight, wall_ns)
+    data = json.dumps(content, separators=(",", ":"), allow_nan=False)
     packed = gzip.compress(data.encode(), mtime=0)
     parts = {
         "policy": escape(policy),
@@ -89,14 +90,20 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
 
     events = []
     for event in flight.events:
-        times = {"from": seconds(event.begin_ns), "to": seconds(event.end_ns)}
-        events.append(asdict(event) | times)
+        content = asdict(event)
+        content["from"] = seconds(event.begin_ns)
+        content["to"] = seconds(event.end_ns)
+        events.append(content)
+    cuts = []
+    for cut in flight.cuts:
+        length_s = cut.length_ns / SECOND
+        cuts.append([seconds(cut.begin_ns), length_s])
     return {
         "escs": [esc.name for esc in flight.escs],
         "from": seconds(flight.start_ns),
         "to": seconds(flight.end_ns),
         "wall": None if wall_ns is None else wall_ns // MS,
-        "cuts": [[seconds(cut.begin_ns), cut.length_ns / SECOND] for cut in flight.cuts],
+        "cuts": cuts,
         "times": [seconds(time_ns) for time_ns in flight.points.times],
         "phases": PHASES,
         "plots": list(_plots(flight)),

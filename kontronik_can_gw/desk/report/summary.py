@@ -43,16 +43,19 @@ def tiles(flight: Flight) -> str:
                 name = escape(esc.name) if several else ""
                 of_escs.append((esc.extremes[source], name))
         if of_escs:
-            extreme, name = min(of_escs) if source in MINIMA else max(of_escs)
+            best = min if source in MINIMA else max
+            extreme, name = best(of_escs)
             value = _plain(extreme.value, digits, VALUES[source].unit)
-            found.append((label, value, f"{_at(extreme, flight)} {name}"))
+            aside = f"{_at(extreme, flight)} {name}"
+            found.append((label, value, aside))
     html = "".join(_tile(*each) for each in found)
     if any(esc.has_errors for esc in escs):
         severities = [event.severity for event in flight.events if event.kind == "error"]
         errors = severities.count("error")
         warnings = severities.count("warning")
         aside = "1 warning" if warnings == 1 else f"{warnings} warnings"
-        html += _tile("Errors", str(errors), aside, "bad" if errors else "good")
+        kind = "bad" if errors else "good"
+        html += _tile("Errors", str(errors), aside, kind)
     return html
 
 
@@ -95,14 +98,18 @@ def _numbers(esc: EscFlight, flight: Flight) -> dict[str, dict[str, str]]:
         lowest = f"{_per_cell(load.value, esc)} {_at(load, flight)}"
         if rest is not None:
             sag = rest - load.value
-    share = 100 * esc.telemetry_ns / max(1, flight.end_ns - flight.start_ns)
-    counts = {
-        label: _value(esc.counted.get(source), 0, VALUES[source].unit)
-        for source, label in COUNTERS.items()
-    }
+    length_ns = max(1, flight.end_ns - flight.start_ns)
+    share = 100 * esc.telemetry_ns / length_ns
+    counts = {}
+    for source, label in COUNTERS.items():
+        count = esc.counted.get(source)
+        counts[label] = _value(count, 0, VALUES[source].unit)
+    turning = ""
+    if esc.has_speed:
+        turning = _bold(duration(esc.turning_ns))
     return {
         "Use": {
-            "Motor turning": _bold(duration(esc.turning_ns)) if esc.has_speed else "",
+            "Motor turning": turning,
             "Energy used": _value(esc.energy_wh, 1, "Wh"),
             "Charge used": counts.pop("Charge used"),
         },
@@ -122,7 +129,9 @@ def _numbers(esc: EscFlight, flight: Flight) -> dict[str, dict[str, str]]:
 
 
 def _extremes(
-    quantities: Mapping[str, tuple[str, int]], esc: EscFlight, flight: Flight
+    quantities: Mapping[str, tuple[str, int]],
+    esc: EscFlight,
+    flight: Flight,
 ) -> dict[str, str]:
     found = {}
     for source, (label, digits) in quantities.items():
@@ -158,4 +167,6 @@ def _value(value: float | None, digits: int, unit: str) -> str:
 def _per_cell(voltage: float | None, esc: EscFlight) -> str:
     if voltage is None or not esc.cells:
         return _value(voltage, 2, "V")
-    return f"{_value(voltage / esc.cells, 3, 'V a cell')} ({_plain(voltage, 2, 'V')})"
+    cell = _value(voltage / esc.cells, 3, "V a cell")
+    battery = _plain(voltage, 2, "V")
+    return f"{cell} ({battery})"

@@ -139,7 +139,10 @@ class CanPort(ABC):
 
     @abstractmethod
     def _send_each(
-        self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+        self,
+        frames: Sequence[CanFrame],
+        clock: Callable[[], int],
+        latest: int,
     ) -> tuple[int, Sent]: ...
 
     @abstractmethod

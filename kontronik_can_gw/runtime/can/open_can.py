@@ -197,7 +197,10 @@ class DriverPort(CanPort):
         return self._dropped
 
     def _send_each(
-        self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+        self,
+        frames: Sequence[CanFrame],
+        clock: Callable[[], int],
+        latest: int,
     ) -> tuple[int, Sent]:
         if self._has_failed():
             return 0, Sent.GONE

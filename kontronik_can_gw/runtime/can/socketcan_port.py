@@ -155,7 +155,10 @@ class SocketCanPort(CanPort):
                 self.state = CanState.ERROR_ACTIVE
 
     def _send_each(
-        self, frames: Sequence[CanFrame], clock: Callable[[], int], latest: int
+        self,
+        frames: Sequence[CanFrame],
+        clock: Callable[[], int],
+        latest: int,
     ) -> tuple[int, Sent]:
         send = self._socket.send
         pack = _CLASSIC.pack

@@ -21,7 +21,10 @@ class ParameterSaver:
     """
 
     def __init__(
-        self, gateway: Gateway, escs: Sequence[EscPort], store: "ParameterStore | None"
+        self,
+        gateway: Gateway,
+        escs: Sequence[EscPort],
+        store: "ParameterStore | None",
     ) -> None:
         self._gateway = gateway
         self._escs = escs

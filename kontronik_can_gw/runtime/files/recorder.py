@@ -77,7 +77,10 @@ class Recorder:
     """Writes the given entries to files, from ``start`` until ``close``."""
 
     def __init__(
-        self, folder: Path, config: RecordConfig, clock: Callable[[], int] = time.monotonic_ns
+        self,
+        folder: Path,
+        config: RecordConfig,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.facts = RecorderFacts()
         self.header: Mapping[str, Any] = {}
@@ -138,7 +141,13 @@ class Recorder:
             raise RunError("captures: cannot be written, because the system cannot start a thread")
 
     def put(
-        self, time_ns: int, kind: int, esc: int, data: bytes, flags: int, came_ns: int | None = None
+        self,
+        time_ns: int,
+        kind: int,
+        esc: int,
+        data: bytes,
+        flags: int,
+        came_ns: int | None = None,
     ) -> None:
         """Record an entry with the fields of ``capture.Entry``. Never waits."""
         if len(self._entries) >= CAPACITY:

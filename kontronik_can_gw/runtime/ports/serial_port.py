@@ -238,7 +238,10 @@ def _open_quietly(path: str) -> int:
 
 
 def _open(
-    path: str, protocol: EscProtocol, is_pty: bool, refuses_parity: bool = False
+    path: str,
+    protocol: EscProtocol,
+    is_pty: bool,
+    refuses_parity: bool = False,
 ) -> serial.Serial:
     parity = serial.PARITY_EVEN if protocol.even_parity else serial.PARITY_NONE
     if refuses_parity:

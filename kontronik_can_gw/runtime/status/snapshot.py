@@ -227,7 +227,11 @@ def _port(port: PortFacts, now: int) -> Document:
 
 
 def _values(
-    esc: EscTelemetry, live: Data | None, info: Data | None, status: GatewayStatus, now: int
+    esc: EscTelemetry,
+    live: Data | None,
+    info: Data | None,
+    status: GatewayStatus,
+    now: int,
 ) -> dict[str, float | None]:
     found: dict[str, float | None] = dict.fromkeys(_NAMES)
     for names, reading in ((_LIVE, live), (_INFO, info)):

@@ -25,7 +25,9 @@ _CLOSE_S = 0.2
 
 
 def open_statistics(
-    configured: Path | None, configuration: Path, warn: Callable[[str], object]
+    configured: Path | None,
+    configuration: Path,
+    warn: Callable[[str], object],
 ) -> "Statistics | None":
     """Start to publish the status of the gateway with this configuration.
 

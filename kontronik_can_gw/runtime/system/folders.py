@@ -24,13 +24,15 @@ STATUS_FILE = "status.json"
 
 def runtime_folder(purpose: str) -> Path:
     """Return this user's folder for a purpose, ``lock`` or ``status``. It may not exist yet."""
-    system = RUN / NAME
-    shared = system / purpose if (system / purpose).exists() else system
-    if os.geteuid() == 0 or os.access(shared, os.W_OK):
-        return system / purpose
+    shared = RUN / NAME / purpose
+    existing = shared if shared.exists() else shared.parent
+    if os.geteuid() == 0 or os.access(existing, os.W_OK):
+        return shared
     *sessions, last = _own_folders()
-    usable = (folder for folder in sessions if os.access(folder.parent, os.W_OK))
-    return next(usable, last) / purpose
+    for folder in sessions:
+        if os.access(folder.parent, os.W_OK):
+            return folder / purpose
+    return last / purpose
 
 
 def make_runtime_folder(purpose: str) -> Path:
@@ -66,9 +68,12 @@ def _own_folders() -> list[Path]:
     """Return the candidates for this user's folder, best first. They may not exist."""
     uid = os.geteuid()
     given = os.environ.get("XDG_RUNTIME_DIR")
-    sessions = [Path(given)] if given else []
-    sessions.append(RUN / "user" / str(uid))
-    return [*(folder / NAME for folder in sessions), TEMPORARY / f"{NAME}-{uid}"]
+    folders = []
+    if given:
+        folders.append(Path(given) / NAME)
+    folders.append(RUN / "user" / str(uid) / NAME)
+    folders.append(TEMPORARY / f"{NAME}-{uid}")
+    return folders
 
 
 def _is_own(folder: Path) -> bool:
@@ -77,5 +82,7 @@ def _is_own(folder: Path) -> bool:
         status = folder.lstat()
     except OSError:
         return False
-    is_closed = not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and is_closed
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
+        return False
+    others_may_write = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return not others_may_write

@@ -15,7 +15,12 @@ _MAX_CHARACTERS = 800
 
 systemd reads 4096 bytes of a datagram, and a character has up to 4 bytes.
 """
-_PRIORITIES = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6}
+_PRIORITIES = {
+    logging.CRITICAL: 2,
+    logging.ERROR: 3,
+    logging.WARNING: 4,
+    logging.INFO: 6,
+}
 """Priority in syslog by the level of logging. Other levels have priority 7 (debug)."""
 
 
@@ -28,14 +33,16 @@ class Notifier:
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        environment = os.environ if environment is None else environment
-        address = environment.get("NOTIFY_SOCKET", "")
-        self._address = {"@": "\0" + address[1:], "/": address}.get(address[:1], "")
-        self.watchdog_ns = _watchdog_ns(environment) if self._address else None
+        if environment is None:
+            environment = os.environ
+        self._address = _address(environment.get("NOTIFY_SOCKET", ""))
+        self.watchdog_ns: int | None = None
         """Longest interval between calls of ``watchdog``: half of the manager's limit.
 
         None if the manager does not watch this process.
         """
+        if self._address:
+            self.watchdog_ns = _watchdog_ns(environment)
         self._socket: socket.socket | None = None
         self._pending: dict[str, str] = {}
         self._status = ""
@@ -88,15 +95,28 @@ class Notifier:
         if not self._address:
             return
         self._pending |= variables
-        message = "".join(f"{name}={value}\n" for name, value in self._pending.items())
+        lines = [f"{name}={value}\n" for name, value in self._pending.items()]
+        message = "".join(lines).encode(errors="replace")
         try:
             if self._socket is None:
                 kind = socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
                 self._socket = socket.socket(socket.AF_UNIX, kind)
-            self._socket.sendto(message.encode(errors="replace"), self._address)
+            self._socket.sendto(message, self._address)
         except (OSError, ValueError):  # queue full, or no listener: the next call sends it
             return
         self._pending.clear()
+
+
+def _address(name: str) -> str:
+    """Return the address of a socket in the file system or, with @, in the abstract namespace.
+
+    Empty for other names.
+    """
+    if name.startswith("@"):
+        return "\0" + name[1:]
+    if name.startswith("/"):
+        return name
+    return ""
 
 
 def _watchdog_ns(environment: Mapping[str, str]) -> int | None:
@@ -114,7 +134,8 @@ def _watchdog_ns(environment: Mapping[str, str]) -> int | None:
 
 def is_journal(stream: TextIO, environment: Mapping[str, str] | None = None) -> bool:
     """Return True if the stream leads to the journal, and is not redirected to a file or pipe."""
-    environment = os.environ if environment is None else environment
+    if environment is None:
+        environment = os.environ
     journal = environment.get("JOURNAL_STREAM", "")
     try:
         status = os.fstat(stream.fileno())
@@ -128,7 +149,9 @@ def log_formatter(stream: TextIO) -> logging.Formatter | None:
 
     It writes a priority, but no time, because the journal adds the time.
     """
-    return JournalFormatter("%(message)s") if is_journal(stream) else None
+    if not is_journal(stream):
+        return None
+    return JournalFormatter("%(message)s")
 
 
 class JournalFormatter(logging.Formatter):
@@ -138,5 +161,6 @@ class JournalFormatter(logging.Formatter):
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        mark = f"<{_PRIORITIES.get(record.levelno, 7)}>"
-        return "\n".join(mark + line for line in super().format(record).split("\n"))
+        priority = _PRIORITIES.get(record.levelno, 7)
+        lines = super().format(record).split("\n")
+        return "\n".join(f"<{priority}>{line}" for line in lines)

@@ -50,14 +50,17 @@ class AscReader(TextReader):
         written = None
         began = None
         for line in lines:
-            head = line.decode("utf-8", "replace").lower().split()
-            if head[:1] == ["base"]:
-                self._base = 10 if head[1:2] == ["dec"] else 16
-                self._relative = head[-1] == "relative"
-            elif head[:1] == ["date"]:
-                written = asc_time(head[2:])
-            elif head[:2] == ["begin", "triggerblock"]:
-                began = asc_time(head[3:])
+            text = line.decode("utf-8", "replace").lower()
+            words = text.split()
+            if words[:1] == ["base"]:
+                self._base = 16
+                if words[1:2] == ["dec"]:
+                    self._base = 10
+                self._relative = words[-1] == "relative"
+            elif words[:1] == ["date"]:
+                written = asc_time(words[2:])
+            elif words[:2] == ["begin", "triggerblock"]:
+                began = asc_time(words[3:])
             else:
                 found = _frame(line)
                 if found is not None:
@@ -68,7 +71,8 @@ class AscReader(TextReader):
         if began is None:
             return
         if found is not None and not self._relative:
-            began = _time_zero(began, written or began, float(found["time"]))
+            first_s = float(found["time"])
+            began = _time_zero(began, written or began, first_s)
         start_ns = _unix_ns(began)
         if start_ns >= OLDEST_WALL_S * SECOND:
             self.wall_start_ns = start_ns
@@ -84,9 +88,9 @@ class AscReader(TextReader):
             time_ns = self._now
         is_fd = words[1:2] == [b"canfd"]
         if b"errorframe" in words[2:5]:
-            channel = words[2] if is_fd else words[1]
             received = b"tx" not in words[2:5]
-            return checked(LogFrame(time_ns, error_frame(), received, str(int(channel))))
+            channel = words[2] if is_fd else words[1]
+            return _logged(time_ns, error_frame(), received, channel)
         if is_fd:
             return self._fd_frame(time_ns, line, words[2:])
         if len(words) > 4 and words[3] in _DIRECTIONS:
@@ -98,16 +102,17 @@ class AscReader(TextReader):
         if direction == _REQUEST:
             return None
         number, extended = self._id(id_word, line)
-        if kind == b"r":  # older files do not have its length
-            has_length = bool(data) and data[0].isalnum() and len(data[0]) <= 2
-            length = int(data[0], self._base) if has_length else 0
+        if kind == b"r":
+            length = 0  # older files do not have it
+            if data and data[0].isalnum() and len(data[0]) <= 2:
+                length = int(data[0], self._base)
             frame = remote_frame(number, length, extended)
         elif kind == b"d":
             length = min(8, int(data[0], self._base))
             frame = CanFrame(number, self._bytes(data[1:], length), extended)
         else:
             raise ValueError
-        return checked(LogFrame(time_ns, frame, direction == b"rx", str(int(channel))))
+        return _logged(time_ns, frame, direction == b"rx", channel)
 
     def _fd_frame(self, time_ns: int, line: bytes, words: list[bytes]) -> LogFrame | None:
         if not words[0].isdigit() or words[1] == _REQUEST:
@@ -124,8 +129,8 @@ class AscReader(TextReader):
         if code and not length:
             frame = remote_frame(number, code, extended)
         else:
-            frame = CanFrame(number, self._bytes(data, length), extended, True)
-        return checked(LogFrame(time_ns, frame, direction == b"rx", str(int(channel))))
+            frame = CanFrame(number, self._bytes(data, length), extended, fd=True)
+        return _logged(time_ns, frame, direction == b"rx", channel)
 
     def _bytes(self, words: list[bytes], length: int) -> bytes:
         if len(words) < length:
@@ -138,14 +143,23 @@ class AscReader(TextReader):
         If ``word`` is a name, the line ends with the id.
         """
         extended = word.endswith(b"x")
-        stated = _decimal_id(line) if b"=" in line else None
+        digits = word.removesuffix(b"x")
+        stated = None
+        if b"=" in line:
+            stated = _decimal_id(line)
         if stated is None:
-            return int(word.removesuffix(b"x"), self._base), extended
+            return int(digits, self._base), extended
         number = int(stated[1])
-        written = word.removesuffix(b"x").lstrip(b"0").upper()
-        if written == format(number, "X" if self._base == 16 else "d").encode():
+        expected = f"{number:X}" if self._base == 16 else str(number)
+        if digits.lstrip(b"0").upper() == expected.encode():
             return number, extended
         return number, bool(stated[2]) or number > 0x7FF
+
+
+def _logged(time_ns: int, frame: CanFrame, received: bool, channel: bytes) -> LogFrame:
+    """Return a checked frame. ``channel`` is a number, possibly with leading zeros."""
+    name = str(int(channel))
+    return checked(LogFrame(time_ns, frame, received, name))
 
 
 def asc_time(words: list[str]) -> _Moment | None:
@@ -183,10 +197,15 @@ def _time_zero(began: _Moment, written: _Moment, first_s: float) -> _Moment:
     It is the beginning of the block, the date of the file, or midnight. The result is the one with
     which the time of the first frame is closest to the beginning of the block.
     """
-    midnight = began[0].replace(hour=0, minute=0, second=0), 0
+    begin, _ = began
+    midnight = (begin.replace(hour=0, minute=0, second=0), 0)
 
     def distance_s(zero: _Moment) -> float:
-        return abs((began[0] - zero[0]).total_seconds() - first_s)
+        moment, _ = zero
+        since_zero = begin - moment
+        return abs(since_zero.total_seconds() - first_s)
 
     closest = min(began, written, midnight, key=distance_s)
-    return closest if distance_s(closest) <= _CLOSE_S else began
+    if distance_s(closest) > _CLOSE_S:
+        return began
+    return closest

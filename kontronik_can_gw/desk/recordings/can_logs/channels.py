@@ -25,11 +25,13 @@ class Channels:
     def number_of(self, channel: str) -> int:
         """Return the channel's number, for formats with numbers."""
         if channel not in self._numbers:
-            taken = set(self._numbers.values())
-            wanted = _natural_number(channel)
-            if wanted in taken or not 1 <= wanted <= _LARGEST:
-                wanted = next(n for n in range(1, len(taken) + 2) if n not in taken)
-            self._numbers[channel] = wanted
+            taken = self._numbers.values()
+            number = _natural_number(channel)
+            if number in taken or not 1 <= number <= _LARGEST:
+                number = 1
+                while number in taken:
+                    number += 1
+            self._numbers[channel] = number
         return self._numbers[channel]
 
     def name_of(self, channel: str) -> str:
@@ -38,9 +40,12 @@ class Channels:
             name = channel or self._own
             if channel.isdigit():
                 name = f"can{self.number_of(channel) - 1}"
-            taken = set(self._names.values())
+            taken = self._names.values()
             if name in taken:
-                name = next(f"can{n}" for n in range(len(taken) + 1) if f"can{n}" not in taken)
+                number = 0
+                while f"can{number}" in taken:
+                    number += 1
+                name = f"can{number}"
             self._names[channel] = name
         return self._names[channel]
 
@@ -49,7 +54,7 @@ class Channels:
         """The changed channels, for example "can0 is 1, can1 is 2". Empty for can0 alone."""
         given = self._names or self._numbers
         changed = {old: new for old, new in given.items() if old and old != str(new)}
-        if [*changed] in (["can0"], ["1"]):
+        if list(changed) in (["can0"], ["1"]):
             return ""
         return ", ".join(f"{old} is {new}" for old, new in changed.items())
 
@@ -60,4 +65,6 @@ def _natural_number(channel: str) -> int:
     if channel.isdigit():
         return int(channel)
     found = _number_in(channel)
-    return int(found[1]) + 1 if found else 0
+    if found is None:
+        return 0
+    return int(found[1]) + 1
