@@ -395,8 +395,7 @@ def test_a_default_text_with_other_letters_is_refused() -> None:
     text = with_object(variable(9, DefaultValue="Gr\u00fc\u00dfe"))
     (found,) = problems(text.encode("latin-1"))
     assert found == (
-        "mine.eds: [2200] DefaultValue=Gr\\xfc\\xdfe has characters outside ASCII. "
-        "Use ASCII only."
+        "mine.eds: [2200] DefaultValue=Gr\\xfc\\xdfe has characters outside ASCII. Use ASCII only."
     )
 
 

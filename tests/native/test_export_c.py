@@ -95,13 +95,8 @@ def test_a_signal_that_the_core_cannot_express_is_refused(
         ' SG_ LinkState : 0|32@1+ (0.00592884289493769,89.21540281025877) [0|0] "" Car\n'
     )
     assert main(["export", "c", "--dbc", str(dbc), str(tmp_path / "out")]) == 2
-<<<<<<< HEAD
     reason = "M.LinkState: factor 0.00592884289493769 exceeds 64 bits. Factor"
-    assert f"not in the core in C: {reason}" in capsys.readouterr().err
-=======
-    reason = "M.LinkState: factor 0.00592884289493769 leaves 64 bits. Factor"
     assert f"cannot be exported: {reason}" in capsys.readouterr().err
->>>>>>> f3ad1b13 (runtime, cli: Say plainly what is wrong and what to do)
     assert not (tmp_path / "out").exists()
 
 
