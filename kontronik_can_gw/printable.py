@@ -29,4 +29,10 @@ def printable_json(
         ensure_ascii=ascii_only,
         allow_nan=allow_nan,
     )
-    return "".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
+    parts = []
+    for character in text:
+        if character.isprintable() or character == "\n":
+            parts.append(character)
+        else:
+            parts.append(json.dumps(character)[1:-1])
+    return "".join(parts)

@@ -48,7 +48,8 @@ def without_clashing_escs(config: Config) -> Config:
     kept: list[EscConfig] = []
     seen: set[object] = set()
     for esc, node_id in zip(config.esc, config.node_ids, strict=True):
-        own: set[object] = {normalize(esc.name), ("port", esc.port)}
+        own: set[object] = {normalize(esc.name)}
+        own.add(("port", esc.port))
         if node_id != UNCONFIGURED:
             own.add(node_id)
         is_valid = node_id <= 127 or node_id == UNCONFIGURED
@@ -205,7 +206,10 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     if problems:
         raise UserError(*problems)
     load_warning = _load_warning(config, dbc.layout, configured)
-    message_ids = {each.can_id: each.name for each in dbc.layout.messages if not each.extended}
+    message_ids = {}
+    for message in dbc.layout.messages:
+        if not message.extended:
+            message_ids[message.can_id] = message.name
     outputs = [setup.fitted(message_ids) for setup in outputs]
     warnings: list[str] = []
     if outputs != configured:
@@ -216,7 +220,8 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     for fitted in outputs:
         warnings += fitted.warnings(config.file, config.can.bitrate)
         damaged += fitted.faults
-    mute = [*unreported(dbc.layout, config.dbc.silent_on_loss), *unsupplied(dbc.layout, escs)]
+    mute = unreported(dbc.layout, config.dbc.silent_on_loss)
+    mute += unsupplied(dbc.layout, escs)
     return Loaded(
         config=config,
         escs=escs,
@@ -224,7 +229,13 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
         layout=dbc.layout,
         damaged=tuple(damaged),
         store=store,
-        warnings=(*config.warnings, *dbc.warnings, *mute, *load_warning, *warnings),
+        warnings=(
+            *config.warnings,
+            *dbc.warnings,
+            *mute,
+            *load_warning,
+            *warnings,
+        ),
         dbc=dbc.content,
         outputs=tuple(outputs),
     )

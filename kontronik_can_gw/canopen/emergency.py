@@ -294,7 +294,10 @@ class Emergencies:
         """Report 0000h if errors were reported or are pending, and all have ended."""
         if self._delayed_since != NEVER:
             return
-        last_is_error = self._pending[-1][0] is not None if self._pending else self._last_is_error
+        last_is_error = self._last_is_error
+        if self._pending:
+            condition, _ = self._pending[-1]
+            last_is_error = condition is not None
         if last_is_error and self._open and not self._active:
             self._report(None)
             self._send_pending(now)

@@ -113,10 +113,12 @@ class BitCodes:
     """The emergency codes of an ESC's error word, whose bits the ESC's protocol lists."""
 
     def __init__(self, bits: Sequence[ErrorBit]) -> None:
-        self._codes = {int(bit): bit.code for bit in bits if bit.code is not None}
+        self._codes: dict[int, int] = {}
         self._summaries: list[tuple[int, int]] = []
         """Each summary bit with all bits of its severity, which explain it."""
         for bit in bits:
+            if bit.code is not None:
+                self._codes[int(bit)] = bit.code
             if bit.is_summary:
                 explained_by = _mask_of(bits, bit.severity)
                 self._summaries.append((1 << bit, explained_by))
@@ -141,7 +143,10 @@ class BitCodes:
         register = 0
         for bit in _bits_of(summary_free & self._error_bits | bits):
             register |= register_of(self.code(bit))
-        conditions = [Condition(self.code(bit), bit, 0) for bit in _bits_of(bits)]
+        conditions = []
+        for bit in _bits_of(bits):
+            condition = Condition(self.code(bit), bit, 0)
+            conditions.append(condition)
         return tuple(conditions), register
 
 

@@ -58,8 +58,10 @@ class EscObjects:
     def apply_settings(self, now: int) -> None:
         """Apply the values of 2100h to the ESC and the emergencies."""
         self._emergencies.mask = self._dictionary.number(at.SETTINGS, 6)
-        if self._esc.live is not None and self._errors is not None:
-            self._emergencies.set_word(self._errors.of(self._esc.live), now, force=True)
+        live = self._esc.live
+        if live is not None and self._errors is not None:
+            errors = self._errors.of(live)
+            self._emergencies.set_word(errors, now, force=True)
         settings = esc_settings(self._dictionary, self._base)
         if settings != self._esc.settings:
             self._changed(settings)
@@ -70,7 +72,8 @@ class EscObjects:
         if events & Event.STATE and live is not None and self._errors is not None:
             errors = self._errors.of(live)
             self._emergencies.set_word(errors, now, at=self._esc.live_ns)
-        if events & (Event.LINK | Event.INFO) or self._is_live is (live is None):
+        has_changed = self._is_live is (live is None)
+        if has_changed or events & (Event.LINK | Event.INFO):
             self._follow_link(events, now)
 
     def _follow_link(self, events: int, now: int) -> None:
@@ -81,12 +84,16 @@ class EscObjects:
             # The port's error begins before other errors end, so that no 0000h is sent in between.
             if link is LinkState.PORT_ERROR:
                 emergencies.set(GatewayError.PORT_GONE, True, now)
+            is_silent = link is LinkState.LOST
             expired_ns = esc.live_bound_ns + esc.settings.timeout_ns
-            emergencies.set(GatewayError.TELEMETRY_LOST, link is LinkState.LOST, now, at=expired_ns)
-            emergencies.set(GatewayError.CRC_RATE, link is LinkState.DEGRADED, now)
-            emergencies.set(GatewayError.PORT_GONE, link is LinkState.PORT_ERROR, now)
-        if events & Event.INFO and esc.info is not None and self._device is not None:
-            device = esc.protocol.value("device_raw", esc.info)
+            emergencies.set(GatewayError.TELEMETRY_LOST, is_silent, now, at=expired_ns)
+            is_degraded = link is LinkState.DEGRADED
+            emergencies.set(GatewayError.CRC_RATE, is_degraded, now)
+            is_port_gone = link is LinkState.PORT_ERROR
+            emergencies.set(GatewayError.PORT_GONE, is_port_gone, now)
+        info = esc.info
+        if events & Event.INFO and info is not None and self._device is not None:
+            device = esc.protocol.value("device_raw", info)
             emergencies.set(GatewayError.OTHER_DEVICE, device != self._device, now)
         is_lost = link in (LinkState.LOST, LinkState.PORT_ERROR)
         if self._is_live and esc.live is None and is_lost:
@@ -101,9 +108,15 @@ class EscObjects:
         Bits 7..0 are the link status of 2020h:1, bits 15..8 the CAN state. Bit 16 is set while
         telemetry is fresh, bit 17 while the information frame is.
         """
-        esc, gateway = self._esc, self._gateway
-        fresh = (esc.live is not None) | (esc.info is not None) << 1
-        return at.link_status(esc, gateway, now) | int(gateway.can_state) << 8 | fresh << 16
+        esc = self._esc
+        gateway = self._gateway
+        register = at.link_status(esc, gateway, now)
+        register |= int(gateway.can_state) << 8
+        if esc.live is not None:
+            register |= 1 << 16
+        if esc.info is not None:
+            register |= 1 << 17
+        return register
 
     def _device_name(self, _now: int) -> bytes:
         protocol = self._esc.protocol

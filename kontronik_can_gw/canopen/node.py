@@ -104,7 +104,8 @@ class Node:
         )
         self.lss = LssSlave(self.identity, partial(self._send, LSS_ANSWER))
         bind_values(dictionary, esc, core.status)
-        self.tpdos = Tpdos(dictionary, partial(core.slot, number), core.status, is_used)
+        new_slot = partial(core.slot, number)
+        self.tpdos = Tpdos(dictionary, new_slot, core.status, is_used)
         self._esc_objects = EscObjects(
             dictionary,
             esc,
@@ -114,8 +115,15 @@ class Node:
             device=settings.device,
             changed=partial(core.apply, number),
         )
-        self._timers = (self._producer, self.consumer, self.sdo, self.emergencies, self.tpdos)
-        dictionary.bind(0x100A, read=lambda _now: settings.version.encode("ascii", "replace"))
+        self._timers = (
+            self._producer,
+            self.consumer,
+            self.sdo,
+            self.emergencies,
+            self.tpdos,
+        )
+        version = settings.version.encode("ascii", "replace")
+        dictionary.bind(0x100A, read=lambda _now: version)
         dictionary.bind(0x1021, read=lambda _now: setup.eds.data)  # the stored EDS
         dictionary.written = self._on_download
 

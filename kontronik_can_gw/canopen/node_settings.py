@@ -70,7 +70,8 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
 def configured_settings(base: EscSettings) -> dict[int, int]:
     """Return the values that the configuration gives to sub-indices of 2100h."""
     standard = _entries(EscSettings())
-    return {sub: given for sub, given in _entries(base).items() if given != standard[sub]}
+    configured = _entries(base)
+    return {sub: given for sub, given in configured.items() if given != standard[sub]}
 
 
 def make_dictionary(
@@ -85,7 +86,9 @@ def make_dictionary(
     has the defaults of settings that the configuration does not change.
     """
     dictionary = Dictionary(eds)
-    power_on = {(at.SETTINGS, sub): given for sub, given in configured_settings(base).items()}
+    power_on = {}
+    for sub, given in configured_settings(base).items():
+        power_on[at.SETTINGS, sub] = given
     if settings.vendor_id is not None:
         power_on[0x1018, 1] = settings.vendor_id
     power_on[0x1018, 4] = settings.serial

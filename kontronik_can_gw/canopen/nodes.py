@@ -214,14 +214,16 @@ class Nodes(NodeOutput):
         """
         if node_id == UNCONFIGURED:
             return False
-        others = [other for other in self.nodes if other is not node]
-        if any(node_id in (other.node_id, other.identity.pending_node_id) for other in others):
-            return True
-        wanted = {first + node_id for first in OF_NODE_ID}
-        wanted |= {cob_id for _, _, cob_id in default_ids(node.dictionary, node_id)}
         used = set(self._message_ids)
-        for other in others:
-            used |= {use.cob_id for use in other.uses()}
+        for other in self.nodes:
+            if other is node:
+                continue
+            if node_id in (other.node_id, other.identity.pending_node_id):
+                return True
+            used.update(use.cob_id for use in other.uses())
+        wanted = {first + node_id for first in OF_NODE_ID}
+        for _, _, cob_id in default_ids(node.dictionary, node_id):
+            wanted.add(cob_id)
         return not wanted.isdisjoint(used)
 
     # --- after each call
@@ -316,8 +318,10 @@ def nodes_alone(
 
     ``message_ids`` are the 11-bit ids that messages use, with their names.
     """
-    core = PythonCore(escs, Layout("", "", ()), 0, silent_on_loss=False)
-    core.own_ids = {can_id: Owner(None, name) for can_id, name in message_ids.items()}
+    no_messages = Layout("", "", ())
+    core = PythonCore(escs, no_messages, 0, silent_on_loss=False)
+    for can_id, name in message_ids.items():
+        core.own_ids[can_id] = Owner(None, name)
     return Nodes(setups, core)
 
 
@@ -334,6 +338,7 @@ def traffic(nodes: Sequence[Node], is_worst: bool) -> tuple[float, float]:
         if period_ms:
             rates.append((_HEARTBEAT_BYTES, 1000 / period_ms))
         for tpdo in node.tpdos:
-            rates.append((_PDO_BYTES, tpdo.worst_rate_hz if is_worst else tpdo.rate_hz))
+            rate = tpdo.worst_rate_hz if is_worst else tpdo.rate_hz
+            rates.append((_PDO_BYTES, rate))
     frames = sum(rate for _, rate in rates)
     return frames, sum(classic_bits(size) * rate for size, rate in rates)

@@ -79,8 +79,12 @@ class CanopenSetup(OutputSetup):
         return Nodes(self.node_setups, host)
 
     def header(self) -> dict[str, Any]:
+        eds = {
+            "file": self.eds.name,
+            "text": self.eds.data.decode("latin-1"),
+        }
         return {
-            "eds": {"file": self.eds.name, "text": self.eds.data.decode("latin-1")},
+            "eds": eds,
             "nodes": [asdict(node) for node in self.settings],
             "stored": [encode(stored).decode("ascii") for stored in self.stored],
             "escs": [esc_json(esc) for esc in self.escs],
@@ -90,7 +94,8 @@ class CanopenSetup(OutputSetup):
     def node_setups(self) -> list[NodeSetup]:
         """The setup of each node."""
         setups = []
-        for number, (settings, stored) in enumerate(zip(self.settings, self.stored, strict=True)):
+        for number, settings in enumerate(self.settings):
+            stored = self.stored[number]
             base = self.escs[number] if self.escs else None
             setups.append(NodeSetup(self.eds, settings, stored, base))
         return setups
@@ -131,7 +136,11 @@ class CanopenSetup(OutputSetup):
         for node in nodes:
             for use in node.uses():
                 ids[use.cob_id] = use.what
-        return _Needs(ids, traffic(nodes, is_worst=False), traffic(nodes, is_worst=True))
+        return _Needs(
+            ids,
+            usual=traffic(nodes, is_worst=False),
+            worst=traffic(nodes, is_worst=True),
+        )
 
     def _escs_in_effect(self) -> list[EscSettings]:
         escs = self.escs or (EscSettings(),) * len(self.settings)
@@ -167,10 +176,16 @@ class CanopenSetup(OutputSetup):
         warnings: list[str] = []
         while True:
             clashing = setup._clashing(escs, message_ids)
-            with_ids = [number for number in sorted(clashing) if setup.stored[number].has_ids]
+            with_ids: list[int] = []
+            with_node_id: list[int] = []
+            for number in sorted(clashing):
+                stored = setup.stored[number]
+                if stored.has_ids:
+                    with_ids.append(number)
+                if stored.node_id is not None:
+                    with_node_id.append(number)
             # Nodes with a stored node-ID first: the other node of the clash may be right.
-            moved = [n for n in with_ids if setup.stored[n].node_id is not None]
-            to_ignore = moved or with_ids
+            to_ignore = with_node_id or with_ids
             if not to_ignore:
                 return replace(setup, notes=(*warnings, *self.notes))
             kept = list(setup.stored)
@@ -198,8 +213,8 @@ class CanopenSetup(OutputSetup):
             is_shared = len(users_of_id) > 1 and any(use.own for _, use in users_of_id)
             if is_shared or cob_id in message_ids:
                 clashing.update(number for number, _ in users_of_id)
-        for number, (settings, stored) in enumerate(zip(self.settings, self.stored, strict=True)):
-            if settings.read_only and stored.node_id == UNCONFIGURED:
+        for number, settings in enumerate(self.settings):
+            if settings.read_only and self.stored[number].node_id == UNCONFIGURED:
                 clashing.add(number)
         return clashing
 
@@ -210,7 +225,8 @@ class CanopenSetup(OutputSetup):
 
     def summary(self, escs: Sequence[EscSettings]) -> list[str]:
         found = []
-        for node, esc in zip(self.nodes(escs).nodes, escs, strict=True):
+        nodes = self.nodes(escs).nodes
+        for node, esc in zip(nodes, escs, strict=True):
             tpdos = sum(tpdo.valid for tpdo in node.tpdos)
             plural = "" if tpdos == 1 else "s"
             words = f"node {node.node_id}, {tpdos} TPDO{plural}"
@@ -239,12 +255,12 @@ def configured(config: Config, machine: Machine) -> CanopenSetup:
     # At this pace SDO block uploads use at most half of the bus.
     segment_ns = 2 * classic_bits(8) * SECOND // config.can.bitrate
     settings = []
-    for number, (esc, node_id) in enumerate(zip(config.esc, config.node_ids, strict=True)):
+    for number, esc in enumerate(config.esc):
         serial = machine.serial_number(number + 1, esc.name)
         if canopen.serial is not None:
             serial = canopen.serial + number & 0xFFFFFFFF
         node = NodeSettings(
-            node_id=node_id,
+            node_id=config.node_ids[number],
             serial=serial,
             vendor_id=canopen.vendor_id,
             self_start=canopen.self_start,
@@ -263,7 +279,13 @@ def configured(config: Config, machine: Machine) -> CanopenSetup:
         )
         notes = (note,)
     nothing_stored = (Stored(),) * len(settings)
-    return CanopenSetup(eds, tuple(settings), nothing_stored, tuple(config.escs), notes=notes)
+    return CanopenSetup(
+        eds,
+        tuple(settings),
+        nothing_stored,
+        escs=tuple(config.escs),
+        notes=notes,
+    )
 
 
 def _read_eds(config: Config, machine: Machine) -> Eds:
@@ -307,7 +329,8 @@ def recorded(found: Mapping[str, Any], _escs: Sequence[EscSettings]) -> CanopenS
     with reading("canopen.stored"):
         stored = tuple(decode(text.encode("ascii")) for text in found["stored"])
     with reading("canopen.escs"):
-        return CanopenSetup(eds, nodes, stored, tuple(esc_of(esc) for esc in found["escs"]))
+        escs = tuple(esc_of(esc) for esc in found["escs"])
+        return CanopenSetup(eds, nodes, stored, escs)
 
 
 def _node(found: Mapping[str, Any]) -> NodeSettings:

@@ -71,14 +71,14 @@ class Stored:
 
     def without_ids(self) -> "Stored":
         """Return a copy without the node-ID and COB-IDs."""
-        left = {
-            key: data for key, data in self.communication.items() if key >> 8 not in _WITH_COB_ID
-        }
+        held = self.communication.items()
+        left = {key: data for key, data in held if key >> 8 not in _WITH_COB_ID}
         return replace(self, node_id=None, communication=left).unverified()
 
     def unverified(self) -> "Stored":
         """Return a copy without 1020h, because it does not describe this configuration."""
-        left = {key: data for key, data in self.communication.items() if key >> 8 != VERIFY}
+        held = self.communication.items()
+        left = {key: data for key, data in held if key >> 8 != VERIFY}
         return replace(self, communication=left)
 
 

@@ -73,7 +73,11 @@ def _plain(span: str, problem: str = "", **schema: Any) -> Kind:
 
 def integer(low: int, high: int, also: int | None = None) -> Kind:
     """Accept a whole number from ``low`` to ``high``, or the greater number ``also``."""
-    schema: dict[str, Any] = {"type": "integer", "minimum": low, "maximum": high}
+    schema: dict[str, Any] = {
+        "type": "integer",
+        "minimum": low,
+        "maximum": high,
+    }
     span = f"{low} … {high}"
     problem = f"is outside {low}..{high}"
     if also is not None:
@@ -169,9 +173,8 @@ def options(path: str, own: frozenset[str]) -> Kind:
             raise ValueError(f"{value!r} is not a string, a number or a boolean")
         return value
 
-    kind = table_of(
-        Kind("strings, numbers or booleans", {"type": ["string", "number", "boolean"]}, entry)
-    )
+    of_entry = {"type": ["string", "number", "boolean"]}
+    kind = table_of(Kind("strings, numbers or booleans", of_entry, entry))
 
     def check(value: Any) -> Any:
         checked = kind.check(value)
@@ -181,7 +184,8 @@ def options(path: str, own: frozenset[str]) -> Kind:
             raise ValueError(f"{name} cannot be set here. Use {path}.{name}.")
         return checked
 
-    return Kind(kind.span, kind.schema | {"propertyNames": {"not": {"enum": sorted(own)}}}, check)
+    schema = kind.schema | {"propertyNames": {"not": {"enum": sorted(own)}}}
+    return Kind(kind.span, schema, check)
 
 
 def _check_ratio(value: Any) -> Fraction:
@@ -205,10 +209,11 @@ def _check_names(value: Any) -> tuple[str, ...]:
 
 
 def _check_source(value: Any) -> Any:
-    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
-        return value
     if isinstance(value, str):
         return TEXT.check(value)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if is_number and math.isfinite(value):
+        return value
     raise ValueError(f"{value!r} is neither the name of a source nor a number")
 
 

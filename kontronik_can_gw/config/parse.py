@@ -64,7 +64,10 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
     return _make_config(tables, str(path))
 
 
-def _make_config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, list[str]]:
+def _make_config(
+    tables: Mapping[str, Any],
+    file: str,
+) -> tuple[Config | None, list[str]]:
     """Return the configuration, or None if a table is invalid, and all mistakes."""
     problems: list[str] = []
     removed: list[str] = []
@@ -72,13 +75,14 @@ def _make_config(tables: Mapping[str, Any], file: str) -> tuple[Config | None, l
         if name not in TABLES:
             near = did_you_mean(name, TABLES, 0.5, or_known=True)
             problems.append(f"{name}: unknown table.{near}")
-    made = {
-        name: _make_table(tables.get(name, {}), name, name, problems, removed)
-        for name in TABLES
-        if name != "esc"
-    }
+    made = {}
+    for name in TABLES:
+        if name != "esc":
+            given = tables.get(name, {})
+            made[name] = _make_table(given, name, name, problems, removed)
     listed = tables.get("esc", [])
-    if not isinstance(listed, list) or not all(isinstance(entry, dict) for entry in listed):
+    is_list = isinstance(listed, list)
+    if not is_list or not all(isinstance(entry, dict) for entry in listed):
         problems.append("esc: must be written [[esc]], once for each ESC")
         listed = []
     elif not listed:
@@ -121,7 +125,9 @@ def _make_table(
         problems.append(f"{place}: must be a table, written [{place}]")
         return None
     before = len(problems)
-    kinds = {row.name: row.metadata["kind"] for row in fields(TABLES[name])}
+    kinds = {}
+    for row in fields(TABLES[name]):
+        kinds[row.name] = row.metadata["kind"]
     values: dict[str, Any] = {}
     for key, value in given.items():
         advice = REMOVED_KEYS.get(f"{name}.{key}")
@@ -206,8 +212,9 @@ def _output_problems(config: Config) -> Iterator[str]:
                 yield f"statistics.file: {str(path)!r} is {what}, which would be overwritten"
     if config.canopen.enabled:
         yield from _node_id_problems(config)
-    elif not config.dbc.enabled and not any(getattr(config, name).enabled for name in OUTPUTS):
-        names = ", ".join(f"{name}.enabled" for name in ("dbc", *OUTPUTS))
+    senders = ("dbc", *OUTPUTS)
+    if not any(getattr(config, name).enabled for name in senders):
+        names = ", ".join(f"{name}.enabled" for name in senders)
         yield f"{names}: all are false, so nothing would be sent. Enable one."
 
 

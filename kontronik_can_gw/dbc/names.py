@@ -31,9 +31,15 @@ _FURTHER = {
     "seqcounter seqcnt seqctr",
     Role.CRC: "chksum chksm cksum pruefsumme",
 }
-_E2E_ENDINGS = {role: tuple(texts.split()) for role, texts in _E2E.items()}
-_ENDINGS = {role: _E2E_ENDINGS[role] + tuple(texts.split()) for role, texts in _FURTHER.items()}
-_LAST_WORDS = {Role.ALIVE: {"bz", "sqc"}, Role.CRC: {"cs", "cks", "chk"}}
+_E2E_ENDINGS: dict[Role, tuple[str, ...]] = {}
+_ENDINGS: dict[Role, tuple[str, ...]] = {}
+for _role, _texts in _E2E.items():
+    _E2E_ENDINGS[_role] = tuple(_texts.split())
+    _ENDINGS[_role] = _E2E_ENDINGS[_role] + tuple(_FURTHER[_role].split())
+_LAST_WORDS = {
+    Role.ALIVE: {"bz", "sqc"},
+    Role.CRC: {"cs", "cks", "chk"},
+}
 """Words that are too short to be endings, because other words end with them, too."""
 _WHOLE = {"counter", "cntr", "cnt", "ctr"}
 """Names that mean a frame counter only without a prefix. An ErrorCounter does not count frames."""
@@ -76,11 +82,14 @@ class Binder:
         """Keys of [dbc.bind] that were found for a signal."""
         self._known: list[dict[str, Value]] = []
         """Values of each ESC by normalized name."""
-        for esc in escs:
-            values = values_of_esc(esc)
-            self._known.append({normalize(name): value for name, value in values.items()})
-        self._prefixes = [(normalize(esc.name), index) for index, esc in enumerate(escs)]
+        self._prefixes: list[tuple[str, int]] = []
         """Normalized name and index of each ESC, the longest name first."""
+        for index, esc in enumerate(escs):
+            known = {}
+            for name, value in values_of_esc(esc).items():
+                known[normalize(name)] = value
+            self._known.append(known)
+            self._prefixes.append((normalize(esc.name), index))
         self._prefixes.sort(key=lambda prefix: -len(prefix[0]))
 
     def by_name(self, name: str, esc: int | None = None) -> tuple[Value, int | None] | None:
@@ -101,7 +110,9 @@ class Binder:
         candidates.append((None, key))
         for candidate, rest in candidates:
             known = VALUES_BY_KEY if candidate is None else self._known[candidate]
-            value = known.get(rest) or known.get(rest.removesuffix("percent"))
+            value = known.get(rest)
+            if value is None:
+                value = known.get(rest.removesuffix("percent"))
             if value is None:
                 continue
             if value.group is Group.GATEWAY:

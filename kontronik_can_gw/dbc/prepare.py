@@ -69,7 +69,8 @@ def prepare(
     if job.problems:
         raise UserError(*dict.fromkeys(job.problems))
     job.warnings += _timing_warnings(job, plans)
-    return Layout(file, node, tuple(plans), tuple(dict.fromkeys(job.warnings)))
+    warnings = dict.fromkeys(job.warnings)
+    return Layout(file, node, tuple(plans), tuple(warnings))
 
 
 def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
@@ -160,7 +161,8 @@ def _unused_settings(
     yield from _unmet("units", settings.units, job.units, condition, file)
     condition = f"message of {node} has this GenMsgSendType"
     yield from _unmet("send_type", settings.send_type, job.send_types, condition, file)
-    for name in sorted(set(settings.e2e_data_ids) - {copy.name for copy in ours}):
+    names = {copy.name for copy in ours}
+    for name in sorted(set(settings.e2e_data_ids) - names):
         yield f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}."
 
 
@@ -232,7 +234,8 @@ def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
     """Return the signal in the frame of a flag that reports lost telemetry. None without it."""
     for signal in message.signals:
         source = signal.source
-        if source is None or signal.esc != flag.esc or signal.page not in (None, flag.page):
+        is_in_frame = signal.page in (None, flag.page)
+        if source is None or not is_in_frame or signal.esc != flag.esc:
             continue
         assert flag.source is not None
         if source.name in _OF_LINK and flag.source.group is Group.LIVE:

@@ -22,9 +22,12 @@ class ValueTable:
     """The value table of a signal: texts of values, and codes for "not available" and "error"."""
 
     def __init__(self, signal: "Signal") -> None:
-        self.entries = {int(raw): str(text) for raw, text in (signal.choices or {}).items()}
-        self.codes = {normalize(text): raw for raw, text in self.entries.items()}
+        self.entries: dict[int, str] = {}
+        self.codes: dict[str, int] = {}
         """Raw values by normalized text."""
+        for raw, text in (signal.choices or {}).items():
+            self.entries[int(raw)] = str(text)
+            self.codes[normalize(str(text))] = int(raw)
         self.not_available = self._first(_NOT_AVAILABLE)
         self.error = self._first(_ERROR)
         self.special: list[int] = []
@@ -68,7 +71,7 @@ def pieces(start: int, length: int, byte_order: str) -> tuple[Piece, ...]:
         width = min(length, start % 8 + 1)
         length -= width
         found.append(Piece(length, width, start - width + 1))
-        start = start // 8 * 8 + 15
+        start = start // 8 * 8 + 15  # the most significant bit of the next byte
     return tuple(reversed(found))
 
 
@@ -122,8 +125,10 @@ def limits(
 
     None if the file has no limits, which is written as [0|0].
     """
-    if signal.minimum is None or signal.maximum is None or signal.minimum == signal.maximum == 0:
+    minimum = signal.minimum
+    maximum = signal.maximum
+    if minimum is None or maximum is None or minimum == maximum == 0:
         return None
-    low = (exact(signal.minimum) - offset) / factor
-    high = (exact(signal.maximum) - offset) / factor
+    low = (exact(minimum) - offset) / factor
+    high = (exact(maximum) - offset) / factor
     return min(low, high), max(low, high)

@@ -115,7 +115,8 @@ def parse_database(
             sort_signals=None,
         )
     except Exception as error:  # cantools raises errors of many types for other text than a DBC
-        reason = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
+        words = str(error)[:_MAX_REASON].split()
+        reason = " ".join(words) or type(error).__name__
         raise UserError(f"{path}: cannot be read as a DBC: {reason}") from None
     if not isinstance(database, cantools.database.Database):
         raise UserError(f"{path}: is not a CAN database")
@@ -232,8 +233,10 @@ class _Rewriting:
         """Replace the texts of enumeration attributes by their numbers."""
         numbers: dict[str, dict[str, int]] = {}
         for name, values in _ENUMERATION.findall(text):
-            texts = [self._unmask(value[0]) for value in _MASKED.finditer(values)]
-            numbers[self._unmask(name)] = {each: number for number, each in enumerate(texts)}
+            number_of = {}
+            for number, value in enumerate(_MASKED.finditer(values)):
+                number_of[self._unmask(value[0])] = number
+            numbers[self._unmask(name)] = number_of
 
         def rewritten(found: re.Match[str]) -> str:
             name = self._unmask(found[2])

@@ -176,7 +176,8 @@ class SignalCompiler:
         )
         if limits is None:
             return plan
-        return replace(plan, limits=(float(limits[0]), float(limits[1])))
+        low, high = limits
+        return replace(plan, limits=(float(low), float(high)))
 
     def _unit(self) -> str:
         """Return the unit according to ``dbc.units``. Empty if there is none."""
@@ -201,7 +202,8 @@ class SignalCompiler:
             return self._bound(plan, *found)
         role = names.protection(name)
         if role is not None:
-            if role is Role.ALIVE and (plan.is_float or plan.low > 0 or plan.high < 2):
+            can_count = not plan.is_float and plan.low <= 0 and plan.high >= 2
+            if role is Role.ALIVE and not can_count:
                 raise UnfitSignal(
                     "an alive counter must be an integer of at least 2 bits with a minimum of 0. "
                     "Otherwise bind it to a constant."
@@ -327,8 +329,11 @@ def _notes_on_names(value: Value, numbers: Mapping[int, int]) -> Iterator[str]:
 def _flag(plan: SignalPlan, on_loss: int | None) -> SignalPlan:
     """Return the plan of a flag in one bit. Both raw values of the bit are values."""
     half = Fraction(1, 2)
-    raws = [math.floor(value * plan.slope + plan.intercept + half) for value in (0, 1)]
-    if any(not plan.low <= raw <= plan.high and raw != plan.error for raw in raws):
+    raws = []
+    for value in (0, 1):
+        raws.append(math.floor(value * plan.slope + plan.intercept + half))
+    outside = [raw for raw in raws if not plan.low <= raw <= plan.high]
+    if any(raw != plan.error for raw in outside):
         sign = " Make it unsigned." if plan.signed else ""
         raise UnfitSignal(f"cannot represent both values of a flag, 0 and 1.{sign}")
     if on_loss is None:

@@ -113,7 +113,8 @@ class View:
         self.frames += 1
         for first, new in chunks:
             self.values[first : first + len(new)] = new
-        self._freshness.note([self._part_of[first] for first, _ in chunks], now)
+        parts = [self._part_of[first] for first, _ in chunks]
+        self._freshness.note(parts, now)
         return chunks
 
     def expire(self, now: int) -> bool:
@@ -121,7 +122,8 @@ class View:
         expired = self._freshness.expire(now)
         for index in expired:
             part = self.reader.parts[index]
-            self.values[part.first : part.first + part.count] = [None] * part.count
+            end = part.first + part.count
+            self.values[part.first : end] = [None] * part.count
         return bool(expired)
 
 

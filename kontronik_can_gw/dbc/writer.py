@@ -171,8 +171,11 @@ def _details(messages: Sequence[MessageRow]) -> tuple[list[str], ...]:
 def _message(sent: Copy) -> MessageRow:
     message = sent.message
     multiplexers = sum(signal.is_multiplexer for signal in message.signals)
-    most_pages = max((len(signal.multiplexer_ids or ()) for signal in message.signals), default=0)
-    in_pages = multiplexers > 1 or most_pages > 1
+    pages = [len(signal.multiplexer_ids or ()) for signal in message.signals]
+    in_pages = multiplexers > 1 or max(pages, default=0) > 1
+    signals = []
+    for signal, name in sent.signals():
+        signals.append(_signal(signal, name, sent.prefix, in_pages))
     groups = []
     for group in message.signal_groups or ():
         names = " ".join(sent.prefix + name for name in group.signal_names)
@@ -184,7 +187,7 @@ def _message(sent: Copy) -> MessageRow:
         senders=message.senders,
         comment=message.comment,
         attributes=_own_attributes(message),
-        signals=[_signal(signal, name, sent.prefix, in_pages) for signal, name in sent.signals()],
+        signals=signals,
         groups=groups,
     )
 

@@ -208,12 +208,14 @@ def physical(
         return None
     if value.per_unit == 1 and value.divisor is _ONE:
         return count
-    return round(count * parts[1] / (value.per_unit * parts[0]), 6)
+    over, under = parts
+    return round(count * under / (value.per_unit * over), 6)
 
 
 def _field_values(protocol: EscProtocol, group: Group) -> Iterator[Value]:
     """Yield the fields of live or info data, then the flags of their error words."""
-    fields = [each for each in protocol.fields if each.is_info is (group is Group.INFO)]
+    is_info = group is Group.INFO
+    fields = [each for each in protocol.fields if each.is_info is is_info]
     for each in fields:
         yield Value(
             name=each.name,
@@ -330,7 +332,8 @@ _NEEDED_FIELDS = {
 
 
 def _pascal(text: str) -> str:
-    return "".join(part[:1].upper() + part[1:].lower() for part in text.split("_"))
+    parts = text.split("_")
+    return "".join([part.capitalize() for part in parts])
 
 
 def _link_values(protocol: EscProtocol) -> Iterator[Value]:
@@ -447,7 +450,10 @@ def values_of(protocol: EscProtocol) -> Mapping[str, Value]:
     for name, value in own.items():
         if name in VALUES and value.unit != VALUES[name].unit:
             raise ValueError(f"ESC protocol {protocol.name}: {name} is in {VALUES[name].unit}")
-    return {name: own.get(name) or _missing(value) for name, value in VALUES.items()} | own
+    found = {}
+    for name, value in VALUES.items():
+        found[name] = own.get(name) or _missing(value)
+    return found | own
 
 
 def with_direction(protocol: EscProtocol, speed: Value) -> Value:

@@ -72,14 +72,18 @@ class IdConflicts:
                 own[key] = (owner, output)
         self._own = own
         self._own_blocks = tuple(key for key in own if key >> 32)
-        ids = frozenset(own).union(*[output.receive_ids for output in self._outputs])
+        received = [output.receive_ids for output in self._outputs]
+        ids = frozenset(own).union(*received)
         if ids != self._receive_ids:
             self._receive_ids = ids
 
     def first_own_id(self) -> int | None:
         """Return the lowest own id that belongs to no node, or None."""
         self._follow()
-        without_node = [key for key, (owner, _) in self._own.items() if owner.esc is None]
+        without_node = []
+        for key, (owner, _) in self._own.items():
+            if owner.esc is None:
+                without_node.append(key)
         return min(without_node, default=None)
 
     def own_blocks(self) -> tuple[int, ...]:
@@ -112,7 +116,8 @@ class IdConflicts:
         """End the conflicts without a frame for ten seconds."""
         if not self._present:
             return
-        for conflict in [c for c in self._present.values() if now - c.last > _OVER_NS]:
+        ended = [each for each in self._present.values() if now - each.last > _OVER_NS]
+        for conflict in ended:
             conflict.over = True
             del self._present[conflict.key]
             self._news.append(conflict)
@@ -125,7 +130,8 @@ class IdConflicts:
         """Return the earliest time at which ``advance`` can have something to do."""
         if not self._present:
             return NEVER
-        return min(each.last + _OVER_NS + 1 for each in self._present.values())
+        oldest = min([each.last for each in self._present.values()])
+        return oldest + _OVER_NS + 1
 
     def take(self) -> list[Conflict]:
         """Return the conflicts that began or ended since the last call."""

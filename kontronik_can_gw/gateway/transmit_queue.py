@@ -115,8 +115,10 @@ class TransmitQueue:
         if frame.page < FIRST_PART:
             return False
         first = frame.page - (frame.page - FIRST_PART) % PARTS
-        keys = [(frame.can_id, frame.extended, first + part) for part in range(PARTS)]
-        waiting = [key in self._waiting for key in keys]
+        waiting = []
+        for page in range(first, first + PARTS):
+            key = (frame.can_id, frame.extended, page)
+            waiting.append(key in self._waiting)
         return any(waiting) and not waiting[0]
 
     def in_order(self) -> list[CanFrame]:
@@ -164,7 +166,9 @@ class TransmitQueue:
         """Drop all frames that are not queued. Return True if there were any."""
         count = len(self._waiting) - self._queued
         self.replaced += count
-        self._waiting = {key: frame for key, frame in self._waiting.items() if frame.queued}
+        measurements = [key for key, frame in self._waiting.items() if not frame.queued]
+        for key in measurements:
+            del self._waiting[key]
         return bool(count)
 
     def clear(self) -> None:

@@ -83,6 +83,7 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
     """Return the function that makes the message's frame."""
     pack = compile_pack(plan)
     crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
+    crc_byte = crc.pieces[0].at // 8 if crc is not None else 0
 
     def make_frame(
         escs: Sequence[EscTelemetry],
@@ -91,9 +92,10 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
         alive: int,
         at: int,
     ) -> CanFrame:
-        data = pack(escs, gateway, now, alive, at).to_bytes(plan.length, "little")
+        bits = pack(escs, gateway, now, alive, at)
+        data = bits.to_bytes(plan.length, "little")
         if crc is not None:
-            data = _insert_crc(data, crc.pieces[0].at // 8, plan.data_id)
+            data = _insert_crc(data, crc_byte, plan.data_id)
         # FIRST_PART and greater numbers mean a part of a transfer. Negative numbers are free.
         page = at if at < FIRST_PART else -at
         return CanFrame(plan.can_id, data, plan.extended, plan.fd, page)
@@ -141,8 +143,9 @@ def _compile_whole(signal: SignalPlan) -> _ReadRaw:
     error = signal.error
     not_available = signal.not_available
     common = signal.slope.denominator * signal.intercept.denominator
-    factor = int(signal.slope * common)
-    offset = int(signal.intercept * common)
+    # Twice the numerators, so that half a raw value is a whole number.
+    factor = 2 * int(signal.slope * common)
+    offset = 2 * int(signal.intercept * common) + common
 
     def read_raw(
         escs: Sequence[EscTelemetry],
@@ -157,9 +160,8 @@ def _compile_whole(signal: SignalPlan) -> _ReadRaw:
         if parts is None:
             return not_available
         over, under = parts
-        value = (2 * (count * factor * under + offset * over) + common * over) // (
-            2 * common * over
-        )
+        dividend = count * factor * under + offset * over
+        value = dividend // (2 * common * over)
         if source.rolls:
             return value % (high + 1)
         if signal.saturates and value < low:
@@ -264,7 +266,8 @@ def has_code(signal: SignalPlan) -> bool:
     """Return True if the code for "not available" differs from every value of the signal."""
     if signal.is_float:
         value = float_of(signal.not_available, signal.length)
-        return math.isnan(value) or not signal.limits[0] <= value <= signal.limits[1]
+        low, high = signal.limits
+        return math.isnan(value) or not low <= value <= high
     if signal.numbers is not None:
         return signal.not_available not in signal.numbers.values()
     return not signal.low <= signal.not_available <= signal.high
@@ -273,7 +276,8 @@ def has_code(signal: SignalPlan) -> bool:
 def float_of(bits: int, length: int) -> float:
     """Return the number that IEEE 754 bits of 16, 32 or 64 bits represent."""
     number: float
-    (number,) = struct.unpack(_FLOATS[length], bits.to_bytes(length // 8, "little"))
+    data = bits.to_bytes(length // 8, "little")
+    (number,) = struct.unpack(_FLOATS[length], data)
     return number
 
 
@@ -300,7 +304,8 @@ def e2e_crc(data: bytes, at: int, data_id: int) -> int:
     Start value and final XOR are 0.
     """
     value = 0
-    for byte in data_id.to_bytes(2, "little") + data[:at] + data[at + 1 :]:
+    covered = data_id.to_bytes(2, "little") + data[:at] + data[at + 1 :]
+    for byte in covered:
         value = _CRC[value ^ byte]
     return value
 

@@ -3,6 +3,7 @@
 The units are listed in ``units.tsv``.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping
 from fractions import Fraction
 from functools import cache
@@ -20,12 +21,22 @@ class Unit(NamedTuple):
 
 Spellings = Mapping[str, Mapping[str, Unit]]
 """For the key of each spelling, its possible units by quantity."""
+_FILE = Path(__file__).with_name("units.tsv")
 _NONE = "none"
 """The quantity of spellings that mean "no unit"."""
 _MOJIBAKE = (("Â", ""), ("Î¼", "µ"))
 """Repairs of UTF-8 texts that were read as Windows-1252."""
 _LETTERS = str.maketrans(
-    {"µ": "u", "μ": "u", "°": "deg", "º": "deg", "˚": "deg", "⁻": "-", "¹": "1", "·": "*"}
+    {
+        "µ": "u",
+        "μ": "u",
+        "°": "deg",
+        "º": "deg",
+        "˚": "deg",
+        "⁻": "-",
+        "¹": "1",
+        "·": "*",
+    }
     | dict.fromkeys("()[]_. ")
 )
 
@@ -48,19 +59,23 @@ def _tables() -> tuple[Spellings, Spellings, tuple[tuple[str, str], ...]]:
     2. the spellings whose case does not matter,
     3. quantity and spelling to show of each unit.
     """
-    exact: dict[str, dict[str, Unit]] = {}
-    loose: dict[str, dict[str, Unit]] = {}
+    exact: defaultdict[str, dict[str, Unit]] = defaultdict(dict)
+    loose: defaultdict[str, dict[str, Unit]] = defaultdict(dict)
     shown = []
-    for line in (Path(__file__).parent / "units.tsv").read_text(encoding="utf-8").splitlines():
+    for line in _FILE.read_text(encoding="utf-8").splitlines():
         if line.startswith("#"):
             continue
         quantity, scale, shift, cased, uncased = line.split("\t")
         unit = Unit(quantity, Fraction(scale), Fraction(shift))
         for text in filter(None, cased.split("|")):
-            exact.setdefault(_key(text) or text, {})[quantity] = unit
+            key = _key(text) or text
+            exact[key][quantity] = unit
         for text in filter(None, uncased.split("|")):
-            loose.setdefault((_key(text) or text).casefold(), {})[quantity] = unit
-        shown.append((quantity, (cased or uncased).split("|")[0]))
+            key = _key(text) or text
+            loose[key.casefold()][quantity] = unit
+        spellings = cased or uncased
+        first, _, _ = spellings.partition("|")
+        shown.append((quantity, first))
     return exact, loose, tuple(shown)
 
 

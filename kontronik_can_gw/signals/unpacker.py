@@ -7,6 +7,7 @@ its message are not available.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -52,7 +53,8 @@ class Column:
     @property
     def is_flag(self) -> bool:
         """True if the value is one bit."""
-        return not self.texts and (self.low, self.high, self.digits) == (0, 1, 0)
+        is_bit = self.low == 0 and self.high == 1
+        return is_bit and self.is_whole
 
     @property
     def is_whole(self) -> bool:
@@ -107,7 +109,9 @@ class SignalReader:
         self.messages: dict[int, FrameParts] = {}
         """The layout's messages by CAN id, with ``EXTENDED`` for ids of 29 bits."""
         for plan in layout.messages:
-            key = plan.can_id | (EXTENDED if plan.extended else 0)
+            key = plan.can_id
+            if plan.extended:
+                key |= EXTENDED
             all_signals = plan.signals
             part_of_page: dict[int | None, int] = {}
             for page in dict.fromkeys((None, *plan.pages)):
@@ -115,7 +119,8 @@ class SignalReader:
                 if not signals:
                     continue
                 part_of_page[page] = len(self.parts)
-                part = Part(len(columns), len(signals), plan, page, Unpacker(signals))
+                unpacker = Unpacker(signals)
+                part = Part(len(columns), len(signals), plan, page, unpacker)
                 self.parts.append(part)
                 columns += [_column(signal, plan, key) for signal in signals]
             page_of = None
@@ -123,9 +128,14 @@ class SignalReader:
                 if signal.role is Role.MULTIPLEXER:
                     page_of = partial(extract, signal.pieces)
                     break
-            common = tuple(part for page, part in part_of_page.items() if page is None)
-            paged = {page: part for page, part in part_of_page.items() if page is not None}
-            self.messages[key] = FrameParts(plan.length, common, paged, page_of)
+            common = []
+            paged = {}
+            for page, index in part_of_page.items():
+                if page is None:
+                    common.append(index)
+                else:
+                    paged[page] = index
+            self.messages[key] = FrameParts(plan.length, tuple(common), paged, page_of)
         self.columns = tuple(columns)
 
     @property
@@ -196,7 +206,10 @@ def _row(signal: SignalPlan) -> tuple[int, int, Callable[[int], Value]]:
         value_of = table.__getitem__
     else:
         value_of = lru_cache(_KEPT_VALUES)(value_of)
-    pieces = [(piece.at, (1 << piece.width) - 1, piece.shift) for piece in signal.pieces]
+    pieces = []
+    for piece in signal.pieces:
+        mask = (1 << piece.width) - 1
+        pieces.append((piece.at, mask, piece.shift))
     if len(pieces) == 1:
         ((at, mask, _),) = pieces
         return at, mask, value_of
@@ -228,11 +241,15 @@ def _value_of(signal: SignalPlan) -> Callable[[int], Value]:
         )
     modulus = 1 << signal.length
     if signal.numbers is not None:
-        texts = {raw % modulus: text for raw, text in signal.texts.items() if raw not in codes}
+        texts = {}
+        for raw, text in signal.texts.items():
+            if raw not in codes:
+                texts[raw % modulus] = text
         return texts.get
     least_negative = modulus >> 1 if signal.signed else modulus
     common = signal.factor.denominator * signal.offset.denominator
-    factor, offset = int(signal.factor * common), int(signal.offset * common)
+    factor = int(signal.factor * common)
+    offset = int(signal.offset * common)
 
     def number(raw: int) -> Value:
         """Return an int if all values are whole, or else the float nearest to the exact value.
@@ -257,23 +274,22 @@ def _conditions_of_lost_flags(
     A flag has no code. It is not available if all other signals in its message, from the
     same kind of frame of the same ESC, have their code for "not available".
     """
-    groups: dict[tuple[int | None, Group], tuple[list[int], list[SignalPlan]]] = {}
+    flags: defaultdict[tuple[int | None, Group], list[int]] = defaultdict(list)
+    masks: defaultdict[tuple[int | None, Group], int] = defaultdict(int)
+    codes: defaultdict[tuple[int | None, Group], int] = defaultdict(int)
     for index, signal in enumerate(signals):
         source = signal.source
-        if source is None or source.group not in (Group.LIVE, Group.INFO) or source.optional:
+        if source is None or source.optional:
             continue
-        flags, others = groups.setdefault((signal.esc, source.group), ([], []))
+        if source.group not in (Group.LIVE, Group.INFO):
+            continue
+        frame = (signal.esc, source.group)
         if _is_flag(signal):
-            flags.append(index)
+            flags[frame].append(index)
         elif has_code(signal):
-            others.append(signal)
-    conditions = []
-    for flags, others in groups.values():
-        if flags and others:
-            mask = sum(place(signal.pieces, -1) for signal in others)
-            codes = sum(place(signal.pieces, signal.not_available) for signal in others)
-            conditions.append((flags, mask, codes))
-    return conditions
+            masks[frame] |= place(signal.pieces, -1)
+            codes[frame] |= place(signal.pieces, signal.not_available)
+    return [(flags[frame], masks[frame], codes[frame]) for frame in flags if masks[frame]]
 
 
 def _is_flag(signal: SignalPlan) -> bool:
@@ -303,9 +319,12 @@ def _column(signal: SignalPlan, plan: MessagePlan, key: int) -> Column:
     texts: tuple[tuple[int, str], ...] = ()
     digits = None
     if signal.is_float:
-        ends = [raw * float(signal.factor) + float(signal.offset) for raw in signal.limits]
+        factor = float(signal.factor)
+        offset = float(signal.offset)
+        ends = [raw * factor + offset for raw in signal.limits]
     else:
-        ends = [float(raw * signal.factor + signal.offset) for raw in (signal.low, signal.high)]
+        raws = (signal.low, signal.high)
+        ends = [float(raw * signal.factor + signal.offset) for raw in raws]
         digits = max(_count_decimals(signal.factor), _count_decimals(signal.offset))
         if signal.numbers is not None:
             texts = tuple(sorted(signal.texts.items()))

@@ -70,9 +70,10 @@ def _sizes() -> str:
 
 
 def _forms() -> str:
-    live_legacy, live_v4, info_legacy, info_v4 = (
-        _form(is_info, layout) for is_info in (False, True) for layout in (Layout.LEGACY, Layout.V4)
-    )
+    live_legacy = _form(False, Layout.LEGACY)
+    live_v4 = _form(False, Layout.V4)
+    info_legacy = _form(True, Layout.LEGACY)
+    info_v4 = _form(True, Layout.V4)
     return (
         "/* Frame length and bytes that the CRC covers, by [is info][is V4]. */\n"
         "#define KCG_FRAME_FORMS \\\n"

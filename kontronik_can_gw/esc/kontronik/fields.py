@@ -115,7 +115,10 @@ def _rows(data: DataType) -> dict[str, Row]:
     return found
 
 
-_ROWS: dict[DataType, dict[str, Row]] = {LiveData: _rows(LiveData), InfoData: _rows(InfoData)}
+_ROWS: dict[DataType, dict[str, Row]] = {
+    LiveData: _rows(LiveData),
+    InfoData: _rows(InfoData),
+}
 
 
 def rows(data: DataType) -> dict[str, Row]:

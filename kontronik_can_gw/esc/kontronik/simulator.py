@@ -47,10 +47,8 @@ _SPEED_PER_VOLT = 2500.0
 """Electrical speed in 1/min for each volt at the motor."""
 _FULL_SPEED = 3.8 * _CELLS * _SPEED_PER_VOLT
 _WITHOUT_BEC_CURRENT = rows(LiveData)["bec_current"].not_on
-_EXTREMES = tuple(
-    name.partition("_")[::2] for name in InfoData._fields if name.startswith(("max_", "min_"))
-)
-"""("max" or "min", name of the live field) for each logged extreme."""
+_EXTREMES = [name for name in InfoData._fields if name.startswith(("max_", "min_"))]
+"""Names of the logged extremes: "max_" or "min_" and the name of the live field."""
 
 
 class Phase(NamedTuple):
@@ -217,9 +215,9 @@ class FlightModel:
     def _update_log(self, live: LiveData) -> None:
         """Update the ESC's own log, the extremes of InfoData."""
         log = self._log
-        for extreme, field_name in _EXTREMES:
+        for name in _EXTREMES:
+            extreme, _, field_name = name.partition("_")
             value = getattr(live, field_name)
-            name = f"{extreme}_{field_name}"
             choose = max if extreme == "max" else min
             log[name] = choose(log.get(name, value), value)
         if not log["max_electrical_speed"]:
@@ -407,5 +405,8 @@ class SimulatedEsc:
         share = self._faults.flipped_bits
         if not share:
             return frame
-        flips = sum(1 << bit for bit in range(8 * len(frame)) if self._flips() < share)
-        return (int.from_bytes(frame, "little") ^ flips).to_bytes(len(frame), "little")
+        bits = int.from_bytes(frame, "little")
+        for bit in range(8 * len(frame)):
+            if self._flips() < share:
+                bits ^= 1 << bit
+        return bits.to_bytes(len(frame), "little")
