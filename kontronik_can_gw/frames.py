@@ -6,7 +6,8 @@ from typing import NamedTuple
 EXTENDED = 0x80000000
 """Marks a 29-bit id among ids of both lengths, as SocketCAN does. Such a number is called a key."""
 MAX_EXTENDED_ID = 0x1FFFFFFF
-FIRST_PART, PARTS = 64, 3
+FIRST_PART = 64
+PARTS = 3
 _KEY = 0xFFFFFFFF
 
 

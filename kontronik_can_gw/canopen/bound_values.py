@@ -91,10 +91,12 @@ def compile_pdo(mapped: Sequence[Variable]) -> SlotPlan:
 
     All nodes share it if the objects only show values.
     """
-    shown = tuple((each.entry, each.bound) for each in mapped if each.bound is not None)
-    if len(shown) == len(mapped):
-        return _shared_pdo(shown)
-    return _compile(mapped)
+    shown = []
+    for variable in mapped:
+        if variable.bound is None:
+            return _compile(mapped)
+        shown.append((variable.entry, variable.bound))
+    return _shared_pdo(tuple(shown))
 
 
 @lru_cache(_MAX_PDOS)

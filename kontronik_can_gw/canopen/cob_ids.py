@@ -10,9 +10,14 @@ FrameTaker = Callable[[bytes, int, int], None]
 Taken = Callable[[int, object], bool]
 """Returns True if a COB-ID has another user than the given one, see ``Use``."""
 
-NMT, EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT = 0x000, 0x080, 0x580, 0x600, 0x700
-"""From EMERGENCY on, the node-ID is added."""
-LSS_ANSWER, LSS_REQUEST = 0x7E4, 0x7E5
+NMT = 0x000
+EMERGENCY = 0x080
+"""To this and the three following COB-IDs the node-ID is added."""
+SDO_ANSWER = 0x580
+SDO_REQUEST = 0x600
+HEARTBEAT = 0x700
+LSS_ANSWER = 0x7E4
+LSS_REQUEST = 0x7E5
 OF_NODE_ID = (EMERGENCY, SDO_ANSWER, SDO_REQUEST, HEARTBEAT)
 INVALID_BIT = 1 << 31
 SYNC = "SYNC"

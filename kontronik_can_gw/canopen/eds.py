@@ -58,7 +58,8 @@ _TYPES = {
 }
 """Name and struct code of each type. The code is empty for texts and domains."""
 TYPE_NAMES = {code: name for code, (name, _) in _TYPES.items()}
-SIGNED = frozenset(code for code, (_, form) in _TYPES.items() if form and form in "bhiq")
+_SIGNED_FORMS = ("b", "h", "i", "q")
+SIGNED = frozenset(code for code, (_, form) in _TYPES.items() if form in _SIGNED_FORMS)
 FLOATS = frozenset({REAL32, REAL64})
 CODECS = {
     code: struct.Struct(f"<{form}")  # little endian
@@ -76,7 +77,8 @@ def range_of(data_type: int) -> tuple[int, int]:
     """Return the lowest and highest value of a whole-number type or BOOLEAN."""
     bits = TYPE_BITS.get(data_type, 0)
     if data_type in SIGNED:
-        return -(1 << bits - 1), (1 << bits - 1) - 1
+        half = 1 << bits - 1
+        return -half, half - 1
     return 0, (1 << bits) - 1
 
 
@@ -102,7 +104,8 @@ class Section:
     keys: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     def get(self, key: str) -> str:
-        return self.keys.get(key.lower(), ("", ""))[1]
+        _, value = self.keys.get(key.lower(), ("", ""))
+        return value
 
     def set(self, key: str, value: object) -> None:
         self.keys[key.lower()] = (key, str(value))
@@ -442,8 +445,9 @@ def _real(text: str, data_type: int) -> float:
     try:
         if "x" not in text.lower():
             return float(text)
-        bits = int(text, 16)
-        number: float = codec.unpack(bits.to_bytes(codec.size, "little"))[0]
+        number: float
+        data = int(text, 16).to_bytes(codec.size, "little")
+        (number,) = codec.unpack(data)
         return number
     except (ValueError, OverflowError):
         raise ValueError(f"DefaultValue={text}: not a number. Use the form 1.5.") from None

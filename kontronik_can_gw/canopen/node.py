@@ -76,12 +76,15 @@ class Node:
         core: OutputHost,
         host: NodeHost,
     ) -> None:
-        self.esc = esc = core.escs[number]
+        esc = core.escs[number]
+        self.esc = esc
         self.due = NEVER
         """The time at which ``advance`` must be called."""
-        self.settings = settings = setup.settings
+        settings = setup.settings
+        self.settings = settings
         base = esc.settings if setup.base is None else setup.base
-        self.dictionary = dictionary = setup.dictionary(base)
+        dictionary = setup.dictionary(base)
+        self.dictionary = dictionary
         self._number = number
         self._host = host
         self.rejected: list[int] = []

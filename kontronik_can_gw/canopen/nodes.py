@@ -148,7 +148,8 @@ class Nodes(NodeOutput):
         if not self._is_on:
             return []
         reported = self._reported
-        self._reported = states = self.node_states()
+        states = self.node_states()
+        self._reported = states
         lines = []
         for index, (node_id, state, _) in enumerate(states):
             if reported and reported[index][:2] == (node_id, state):

@@ -21,13 +21,22 @@ def check_counters(counters: Sequence[int]) -> None:
     """Raise ValueError for numbers that are impossible in a COUNTERS entry."""
     if len(counters) != len(COUNTERS):
         raise ValueError("has an unexpected number of counters")
-    check_time(counters[-1])
-    if max(counters[:-1]) >= MAX_COUNT:
-        raise ValueError(f"counter {max(counters[:-1])}")
+    *counts, started_ns = counters
+    check_time(started_ns)
+    largest = max(counts)
+    if largest >= MAX_COUNT:
+        raise ValueError(f"counter {largest}")
 
 
-_LIMITS_OF_ESC = {"energy": _MAX_MW_NS, "run_time": END_OF_TIME - 1, "losses": MAX_COUNT - 1}
-_LIMITS_OF_GATEWAY = {"started_ns": END_OF_TIME - 1, "can_state": 5}
+_LIMITS_OF_ESC = {
+    "energy": _MAX_MW_NS,
+    "run_time": END_OF_TIME - 1,
+    "losses": MAX_COUNT - 1,
+}
+_LIMITS_OF_GATEWAY = {
+    "started_ns": END_OF_TIME - 1,
+    "can_state": 5,
+}
 
 
 def check_state(state: Mapping[str, Any]) -> None:

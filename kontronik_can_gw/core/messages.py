@@ -18,7 +18,8 @@ from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, NEVER
 
-_CYCLE, _REQUEST = 1, 2
+_CYCLE = 1
+_REQUEST = 2
 """Why a message is pending. It is always sent for its cycle, and for a request if it has news."""
 _MIN_DISTANCE_NS = MS
 """Minimum distance between frames of a message that are not caused by an event."""

@@ -222,7 +222,8 @@ class PythonSlot:
 
     def frames(self, now: int) -> list[CanFrame]:
         """Return the frames to send now. There are none if it needs live data that is lost."""
-        settings, escs = self._settings, self._escs
+        settings = self._settings
+        escs = self._escs
         assert settings is not None
         plan = settings.plan
         if plan.paced and not self._is_known(plan):

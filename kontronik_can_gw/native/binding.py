@@ -24,8 +24,9 @@ _SIZED = (
     "kcg_turns",
 )
 """Structures in the order of kcg_sizes, kcg_offline_sizes and kcg_turns_size."""
-_IN_CORE, _IN_OFFLINE = 6, 3
-"""Number of structures whose sizes kcg_sizes and kcg_offline_sizes return."""
+_IN_CORE = 6
+_IN_OFFLINE = 3
+"""Numbers of structures whose sizes kcg_sizes and kcg_offline_sizes return."""
 _head = struct.Struct("=IBBB").unpack_from
 _new = tuple.__new__
 
@@ -46,7 +47,8 @@ def load(path: Path) -> Any:
         library.kcg_turn = released.kcg_turn
         for name, (result, *arguments) in functions():
             function = getattr(library, name)
-            function.restype, function.argtypes = result, arguments
+            function.restype = result
+            function.argtypes = arguments
     except (OSError, AttributeError) as error:
         raise WrongObject(f"{path.name}: {error}") from None
     sizes = [library.kcg_sizes(1 + number) for number in range(_IN_CORE)]

@@ -89,7 +89,11 @@ uint32_t kcg_crc32(uint32_t crc, const uint8_t *p, size_t n)
 
 /* The four forms of frames, by [is info][LEGACY_FORM or V4_FORM]. */
 static const struct { uint8_t length, covered; } forms[2][2] = KCG_FRAME_FORMS;
-enum { LEGACY_FORM, V4_FORM, NO_FORM };
+enum {
+    LEGACY_FORM,
+    V4_FORM,
+    NO_FORM
+};
 
 /* Counts the bytes b[from] to b[to - 1] as dropped: under `blame` before `blame_until`, then under
    `reason`. */
@@ -325,7 +329,12 @@ uint64_t kcg_count(const kcg_esc *e, int what)
 }
 
 /* Counters at the beginning of a second: indices of kcg_esc.window. */
-enum { LIVE_FRAMES, DROPPED_BYTES, BYTES, CRC_ERRORS };
+enum {
+    LIVE_FRAMES,
+    DROPPED_BYTES,
+    BYTES,
+    CRC_ERRORS
+};
 
 static void note_window(const kcg_esc *e, uint32_t *window)
 {

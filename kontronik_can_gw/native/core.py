@@ -88,10 +88,9 @@ class NativeCore:
         self._make(tables, now)
         self.status = cast(GatewayStatus, NativeStatus.from_buffer(self.state.gateway))
         self.status.esc_count = len(escs)
-        self.escs = [
-            NativeEsc(settings, state)
-            for settings, state in zip(escs, self.esc_states, strict=True)
-        ]
+        self.escs: list[NativeEsc] = []
+        for settings, state in zip(escs, self.esc_states, strict=True):
+            self.escs.append(NativeEsc(settings, state))
         self.own_ids: dict[int, Owner] = own_ids(layout)
         self._slots = Slots(self.escs, self.status)
         self._followers: Sequence[Follower] = ()
@@ -103,28 +102,32 @@ class NativeCore:
         """Start the core. ``state``, ``esc_states``, ``sending`` and ``pending`` are its memory."""
         self.pages = tables.pages
         arrays = {}
+        addresses = {}
         for name, (kind, rows) in tables.arrays.items():
-            arrays[name] = _array(kind, rows)
+            array = _array(kind, rows)
+            arrays[name] = array
+            addresses[name] = c.addressof(array)
         self.messages = arrays["message"]
         self.signals = arrays["signal"]
         self.pieces = arrays["piece"]
         self.constants = arrays["constant"]
         self.slot_rows = _array(SlotRow, tables.slots)
         self._kept = [*arrays.values(), self.slot_rows]
-        addresses = {name: c.addressof(array) for name, array in arrays.items()}
         slot_row = c.addressof(self.slot_rows)
         self.plan = _Plan(**addresses, **tables.counts, slot_row=slot_row)
         plan = c.byref(self.plan)
         size = self.library.kcg_size(plan)
         self._memory = (c.c_uint64 * (size // 8 + 1))()
         settings = _array(Settings, tables.settings)
-        self.core = self.library.kcg_init(self._memory, plan, settings, now)
-        self.state = _Core.from_buffer(self._memory)
-        count = self.plan.messages + self.plan.slots
         memory = self._memory
-        self.esc_states = _part(memory, _Esc, len(tables.settings), self.state.esc)
-        self.sending = _part(memory, _Sending, count, self.state.sending)
-        self.pending = _part(memory, c.c_uint16, count, self.state.pending)
+        self.core = self.library.kcg_init(memory, plan, settings, now)
+        state = _Core.from_buffer(memory)
+        self.state = state
+        escs = len(tables.settings)
+        count = self.plan.messages + self.plan.slots
+        self.esc_states = _part(memory, _Esc, escs, state.esc)
+        self.sending = _part(memory, _Sending, count, state.sending)
+        self.pending = _part(memory, c.c_uint16, count, state.pending)
         self._frames = (Frame * _MAX_FRAMES)()
         self._raw = memoryview(self._frames).cast("B")
 
@@ -192,7 +195,8 @@ class NativeCore:
         since: int,
     ) -> None:
         _check(esc, now, len(self.escs))
-        receive, core = self.library.kcg_receive, self.core
+        receive = self.library.kcg_receive
+        core = self.core
         for begin in range(0, len(data) or 1, KCG.MAX_READ):
             part = data
             if len(data) > KCG.MAX_READ:
@@ -251,7 +255,8 @@ class NativeCore:
     def take(self, now: int) -> list[CanFrame]:
         frames: list[CanFrame] = []
         in_python = self._slots.take_each(now)
-        library, core = self.library, self.core
+        library = self.library
+        core = self.core
         while count := library.kcg_take(core, now, self._frames, _MAX_FRAMES):
             found = frames_in(self._raw, 0, count)
             frames += _merged(self, found, in_python) if in_python else found

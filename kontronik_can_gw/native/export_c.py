@@ -45,17 +45,20 @@ def exported(
         core_h, count = re.subn(rf"(#define {name} +)\d+", rf"\g<1>{value}", core_h)
         assert count == 1, name
     names = _names("KCG_MESSAGE_", tables.names["message"])
-    messages = [
-        f"| {name.removeprefix('KCG_MESSAGE_')} | {_id(row)} | {row.length} |"
-        for name, row in zip(names, tables.messages, strict=True)
-    ]
-    dbc = _plain(layout.file.rpartition("/")[2])
-    sizes = [ctypes.sizeof(kind) * len(rows) for kind, rows in tables.arrays.values()]
+    messages = []
+    for name, row in zip(names, tables.messages, strict=True):
+        short = name.removeprefix("KCG_MESSAGE_")
+        messages.append(f"| {short} | {_id(row)} | {row.length} |")
+    _, _, file_name = layout.file.rpartition("/")
+    dbc = _plain(file_name)
+    size = 0
+    for kind, rows in tables.arrays.values():
+        size += ctypes.sizeof(kind) * len(rows)
     words = {
         "dbc": dbc,
         "messages": "\n".join(messages),
         "escs": ", ".join(_plain(esc.name) for esc in escs),
-        "tables": sum(sizes),
+        "tables": size,
         "licence": licence.strip(),
         "mark": MARK,
         "version": __version__,
@@ -80,11 +83,14 @@ def exported(
 def _options(layout: Layout, tables: Tables) -> dict[str, int]:
     """Return the values of core.h's macros that this layout needs."""
     longest = max((plan.length for plan in layout.messages), default=0)
+    has_floats = any(row.flags & KCG.REAL for row in tables.signals)
+    has_pages = any(row.pages > 1 for row in tables.messages)
+    has_crcs = any(row.flags & KCG.HAS_CRC for row in tables.messages)
     return {
         "KCG_DATA": _CLASSIC if longest <= _CLASSIC else 64,
-        "KCG_FLOATS": int(any(row.flags & KCG.REAL for row in tables.signals)),
-        "KCG_PAGED": int(any(row.pages > 1 for row in tables.messages)),
-        "KCG_E2E": int(any(row.flags & KCG.HAS_CRC for row in tables.messages)),
+        "KCG_FLOATS": int(has_floats),
+        "KCG_PAGED": int(has_pages),
+        "KCG_E2E": int(has_crcs),
     }
 
 
@@ -137,8 +143,10 @@ def _tables(tables: Tables) -> Iterator[str]:
     yield "\nconst kcg_settings kcg_esc_settings[KCG_ESCS] = {"
     yield from _rows(Settings, tables.settings, None)
     yield "};\n\nconst kcg_plan kcg_tables = {"
-    yield "    " + ", ".join(f".{name} = {name}" for name in tables.arrays) + ","
-    yield "    " + ", ".join(f".{name} = {number}" for name, number in tables.counts.items())
+    addresses = [f".{name} = {name}" for name in tables.arrays]
+    numbers = [f".{name} = {number}" for name, number in tables.counts.items()]
+    yield f"    {', '.join(addresses)},"
+    yield f"    {', '.join(numbers)}"
     yield "};\n"
 
 
@@ -194,7 +202,8 @@ def _names(prefix: str, texts: Sequence[str]) -> list[str]:
     taken = set(re.findall(r"KCG_\w+", headers))
     found: list[str] = []
     for text in texts:
-        name = base = prefix + re.sub(r"\W", "_", text, flags=re.ASCII)
+        base = prefix + re.sub(r"\W", "_", text, flags=re.ASCII)
+        name = base
         number = 2
         while name in found or not taken.isdisjoint(_forms(name)):
             name = f"{base}_{number}"
@@ -204,7 +213,9 @@ def _names(prefix: str, texts: Sequence[str]) -> list[str]:
 
 
 def _forms(name: str) -> list[str]:
-    return [name.replace("MESSAGE", form, 1) for form in ("MESSAGE", "ID", "LENGTH")]
+    can_id = name.replace("MESSAGE", "ID", 1)
+    length = name.replace("MESSAGE", "LENGTH", 1)
+    return [name, can_id, length]
 
 
 def _plain(text: str) -> str:

@@ -126,7 +126,11 @@ def enumeration(first: str, prefix: str = "KCG_") -> list[str]:
     Names without the prefix are left out. The others are in lower case, without it.
     """
     (names,) = (names for names in _ENUMERATIONS if names[0] == first)
-    return [name.removeprefix(prefix).lower() for name in names if name.startswith(prefix)]
+    found = []
+    for name in names:
+        if name.startswith(prefix):
+            found.append(name.removeprefix(prefix).lower())
+    return found
 
 
 def _ctype(of: str, pointer: str, texts: Container[str]) -> Any:

@@ -13,7 +13,13 @@
 typedef char kcg_max_read_is_too_large_for_kcg_found
     [(KCG_MAX_READ + KCG_MAX_HELD) / KCG_SHORTEST_FRAME <= KCG_FOUND ? 1 : -1];
 /* Kinds of entries (twin: capture/format.py, Kind). */
-enum { BYTES = 1, FRAME = 2, ADVANCE = 3, COUNTERS = 14, NOT_SENT = 18 };
+enum {
+    BYTES = 1,
+    FRAME = 2,
+    ADVANCE = 3,
+    COUNTERS = 14,
+    NOT_SENT = 18
+};
 enum {
     COUNT = 4,                     /* Bytes of a block's number of entries. */
     ENTRY = 16,                    /* Bytes of an entry. */

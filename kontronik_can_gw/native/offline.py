@@ -36,8 +36,10 @@ class FrameRoom:
     def move_to(self, other: "FrameRoom", begin: int, count: int) -> None:
         """Copy ``count`` frames from index ``begin`` on to the beginning of another room."""
         size = c.sizeof(Frame)
-        c.memmove(other.frames, c.addressof(self.frames) + size * begin, size * count)
-        c.memmove(other.times, c.addressof(self.times) + 8 * begin, 8 * count)
+        first_frame = c.addressof(self.frames) + size * begin
+        c.memmove(other.frames, first_frame, size * count)
+        first_time = c.addressof(self.times) + 8 * begin
+        c.memmove(other.times, first_time, 8 * count)
 
     def candump(
         self,
@@ -54,7 +56,14 @@ class FrameRoom:
             self._text = c.create_string_buffer(self.size * longest_line)
         frames = c.byref(self.frames, begin * c.sizeof(Frame))
         times = c.byref(self.times, begin * 8)
-        length = self.library.kcg_candump(frames, times, count, shift_ns, name, self._text)
+        length = self.library.kcg_candump(
+            frames,
+            times,
+            count,
+            shift_ns,
+            name,
+            self._text,
+        )
         return memoryview(self._text).cast("B")[:length]
 
 
@@ -65,8 +74,11 @@ class Frames:
     """
 
     def __init__(self, room: FrameRoom, begin: int, end: int) -> None:
-        self._room, self._begin, self._end = room, begin, end
-        self.times = memoryview(room.times).cast("B").cast("q")[begin:end]
+        self._room = room
+        self._begin = begin
+        self._end = end
+        all_times = memoryview(room.times).cast("B").cast("q")
+        self.times = all_times[begin:end]
 
     def __len__(self) -> int:
         return self._end - self._begin
@@ -77,7 +89,8 @@ class Frames:
 
     def __iter__(self) -> Iterator[tuple[int, CanFrame]]:
         memory = memoryview(self._room.frames).cast("B")
-        frames = frames_in(memory, self._begin * c.sizeof(Frame), len(self))
+        first_byte = self._begin * c.sizeof(Frame)
+        frames = frames_in(memory, first_byte, len(self))
         return zip(self.times, frames, strict=True)
 
     def candump(self, shift_ns: int, channel: str) -> memoryview:
@@ -136,10 +149,14 @@ class Rows:
         """Return the values of the rows ``begin`` to ``end``, with None for not available."""
         found: list[float | None] = self.values(column)[begin:end].tolist()
         first = begin >> 3
-        for at, bits in enumerate(self.valid[column][first : (end + 7) >> 3], first):
+        last = (end + 7) >> 3
+        valid = self.valid[column][first:last]
+        for at, bits in enumerate(valid, first):
             if bits == 0xFF:
                 continue
-            for row in range(max(8 * at, begin), min(8 * at + 8, end)):
+            first_row = max(8 * at, begin)
+            last_row = min(8 * at + 8, end)
+            for row in range(first_row, last_row):
                 if not bits >> (row & 7) & 1:
                     found[row - begin] = None
         return found
@@ -169,11 +186,13 @@ class Lines:
             cell.prefix = prefix
             self._longest += len(prefix) + 32
             if words is not None:
-                table = (_Word * max(1, len(words)))(*starmap(_Word, words))
+                room = max(1, len(words))
+                table = (_Word * room)(*starmap(_Word, words))
                 self._kept.append(table)
                 cell.word = c.addressof(table)
                 cell.words = len(words)
-                self._longest += max((len(text) for _, text in words), default=0)
+                lengths = [len(text) for _, text in words]
+                self._longest += max(lengths, default=0)
 
     def of(
         self,

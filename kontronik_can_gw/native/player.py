@@ -39,11 +39,13 @@ class Player(Output):
 
     def bind(self, core: NativeCore, now: int) -> None:
         """Use this core for playing. Raises NotInCore if it does not have one of the values."""
-        self._library = library = core.library
+        library = core.library
+        self._library = library
         self._settings = core.escs[0].settings
         self._state.core = core.core
         if self._columns is None:
-            self._state.room = size = max(_FRAMES, 2 * core.pages)
+            size = max(_FRAMES, 2 * core.pages)
+            self._state.room = size
             self._rooms = [FrameRoom(library, size) for _ in range(2)]
             self._set_room()
             return
@@ -62,10 +64,13 @@ class Player(Output):
 
         def place(number: int) -> tuple[int, bool]:
             value, esc = columns[number]
-            return count if esc is None else esc, value.group.value == "info"
+            esc_number = count if esc is None else esc
+            return esc_number, value.group.value == "info"
 
         order = sorted(range(len(columns)), key=place)
-        self._table = table = (_Column * max(1, len(order)))()
+        rows = max(1, len(order))
+        table = (_Column * rows)()
+        self._table = table
         ages = []
         for at, number in enumerate(order):
             value, esc = columns[number]
@@ -141,15 +146,21 @@ class Player(Output):
         """
         state = self._state
         state.last = last_ns
-        why = self._library.kcg_play(c.byref(state), self._payload, len(self._payload))
+        payload = self._payload
+        why = self._library.kcg_play(c.byref(state), payload, len(payload))
         return why == KCG.OTHER_ENTRY, state.last
 
     # --- plain bytes of one ESC
 
     def set_bytes(self, period_ns: int) -> None:
         """Prepare for plain bytes: they get a time for each live frame, every ``period_ns``."""
-        layout = Layout("", "", ())
-        self._finder = NativeCore(self._library, [self._settings], layout, 0, False)
+        self._finder = NativeCore(
+            self._library,
+            [self._settings],
+            Layout("", "", ()),
+            now=0,
+            silent_on_loss=False,
+        )
         self._finder.state.mask = 0  # no events
         self._state.finder = self._finder.core
         self._state.period = period_ns

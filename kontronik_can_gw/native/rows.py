@@ -43,7 +43,8 @@ class Rows:
 
     def __init__(self, kind: Any) -> None:
         self.data = bytearray()
-        self._kind, self._size = kind, c.sizeof(kind)
+        self._kind = kind
+        self._size = c.sizeof(kind)
 
     def append(self, row: Any) -> None:
         self.data += row
@@ -82,7 +83,8 @@ def settings_of(esc: EscSettings) -> Any:
 
     Raises NotInCore beyond the limits within which all products of tables.py fit into int64.
     """
-    numerator, denominator = esc.gear.numerator, esc.gear.denominator
+    numerator = esc.gear.numerator
+    denominator = esc.gear.denominator
     if max(numerator, denominator) > MAX_GEAR:
         raise NotInCore(f"{esc.name}: gear {esc.gear} has a number above {MAX_GEAR}")
     if esc.pole_pairs > MAX_POLES or esc.cell_count > MAX_CELLS:

@@ -149,7 +149,8 @@ def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
     if signal.numbers is None and max(greatest, div * by) >= _LIMIT // 2:
         raise NotInCore(f"factor {_decimal(signal.factor)} exceeds 63 bits")
     if signal.numbers is None:
-        row.mul, row.div = mul, div
+        row.mul = mul
+        row.div = div
     row.add = _bits_of(float(signal.intercept))
     if signal.intercept == 0:
         row.flags |= KCG.PLAIN

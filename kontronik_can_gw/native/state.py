@@ -30,7 +30,11 @@ _FIELDS = {
 def _forms(protocol: EscProtocol) -> Sequence[tuple[struct.Struct, Any]]:
     """Return how to unpack live data and info data, and their types."""
     assert protocol.wire is not None
-    return [(struct.Struct("<" + codes), kind) for codes, kind in protocol.wire]
+    forms = []
+    for codes, data_type in protocol.wire:
+        little_endian = struct.Struct("<" + codes)
+        forms.append((little_endian, data_type))
+    return forms
 
 
 class NativeEsc(EscTelemetry):
@@ -65,7 +69,8 @@ class NativeEsc(EscTelemetry):
 
     def reading(self, kind: int) -> Data | None:
         """Return the data of a kind of readings, or None if there are none."""
-        state, known = self._state, self._readings
+        state = self._state
+        known = self._readings
         if state.generation != self._generation:
             self._generation = state.generation
             known.clear()
@@ -122,24 +127,27 @@ def _count(place: int) -> property:
 
 
 _COUNTS = ("losses", "late_frames", "suspect_frames")
-_WRITABLE = {name: _count(COUNTS.index(name)) for name in _COUNTS} | {
+_WRITABLE = {
     "energy_mw_ns": property(_energy, _set_energy),
     "run_time_ns": property(lambda esc: esc._state.run_time, _set_run_time),
 }
 """Attributes that can be set. A later part of a capture begins with the earlier values."""
+for _name in _COUNTS:
+    _WRITABLE[_name] = _count(COUNTS.index(_name))
 for _name, _property in _WRITABLE.items():
     setattr(NativeEsc, _name, _property)
 
 
-_GATEWAY_STATES, _CAN_STATES = tuple(GatewayState), tuple(CanState)
+_GATEWAY_STATES = tuple(GatewayState)
+_CAN_STATES = tuple(CanState)
+_FIELD_NAMES = {"can_state": "can_state_number"}
+"""Names of fields whose C name is a property here."""
 
 
 class NativeStatus(c.Structure):
     """The twin of GatewayStatus in the core's memory (kcg.gateway)."""
 
-    _fields_ = tuple(
-        (f"{name}_number" if name == "can_state" else name, c.c_int64) for name in GATEWAY
-    )
+    _fields_ = tuple((_FIELD_NAMES.get(name, name), c.c_int64) for name in GATEWAY)
 
     @property
     def state(self) -> GatewayState:

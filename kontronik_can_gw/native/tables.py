@@ -8,7 +8,7 @@ raises NotInCore, too. Then the core in Python runs the whole gateway (load.py, 
 import struct
 from collections.abc import Sequence
 from ctypes import c_uint16, c_uint64
-from itertools import accumulate
+from itertools import accumulate, chain
 from typing import Any
 
 from kontronik_can_gw.core.messages import Traits, phases
@@ -95,18 +95,19 @@ class Tables:
     @property
     def names(self) -> dict[str, list[str]]:
         """Names of the rows of the tables of messages and signals."""
-        signals = [
-            f"{plan.name}.{signal.name}"
-            for plan in self._plans
-            for signal in plan.signals
-            if signal.role in (Role.SOURCE, Role.ALIVE)
-        ]
-        return {"message": [plan.name for plan in self._plans], "signal": signals}
+        messages = []
+        signals = []
+        for plan in self._plans:
+            messages.append(plan.name)
+            for signal in plan.signals:
+                if signal.role in (Role.SOURCE, Role.ALIVE):
+                    signals.append(f"{plan.name}.{signal.name}")
+        return {"message": messages, "signal": signals}
 
     @property
     def listeners(self) -> list[int]:
         """``listeners_of`` of all ESCs, one after the other."""
-        return [index for each in self.listeners_of for index in each]
+        return [*chain.from_iterable(self.listeners_of)]
 
     @property
     def first_listeners(self) -> list[int]:
@@ -158,8 +159,11 @@ class Tables:
                 self._add_signal(signal, plan, crc is not None)
         first_esc = len(self.esc_of)
         self.esc_of += sorted(plan.escs)
+        key = plan.can_id
+        if plan.extended:
+            key |= EXTENDED
         row = Message(
-            id=plan.can_id | (EXTENDED if plan.extended else 0),
+            id=key,
             length=plan.length,
             words=words,
             flags=flags,
@@ -237,7 +241,8 @@ class Tables:
         set_scale(row, signal, value)
 
 
-Places = tuple[list[tuple[int, int]], list[tuple[int, int]]]
+Words = list[tuple[int, int]]
+Places = tuple[Words, Words]
 """Offset after the header and wire type of each word, for live data and info data."""
 _KINDS = {
     Kind.INTEGRAL: KCG.OF_ENERGY,

@@ -50,7 +50,8 @@ class Turns:
         self._queue: Any = self._state.queue
         self._ports: Any = self._state.ports
         self._ports.epoll = -1
-        self._address = address = c.byref(self._state)
+        address = c.byref(self._state)
+        self._address = address
         self._watch = library.kcg_watch
         self.begin = partial(library.kcg_begin, address)
         """Start a run. To be called before the first ``run``."""
@@ -85,7 +86,8 @@ class Turns:
 
     def add_output_frames(self, frames: Sequence[CanFrame]) -> bool:
         """Queue frames of outputs before the core's. Return False if the loop must send them."""
-        queue, raw = self._queue, self._raw
+        queue = self._queue
+        raw = self._raw
         waiting = queue.count
         count = waiting + len(frames)
         if waiting != queue.from_outputs or count > KCG.MADE:
@@ -94,13 +96,15 @@ class Turns:
         for can_id, data, extended, fd, _, remote, _ in frames:
             if fd or remote:
                 return False
-            _CLASSIC.pack_into(raw, at, can_id | EXTENDED if extended else can_id, len(data), data)
+            key = can_id | EXTENDED if extended else can_id
+            _CLASSIC.pack_into(raw, at, key, len(data), data)
             at += _FRAME_SIZE
         if not waiting:  # how long the bus was full before does not count for these
             queue.full_since = self.times.now
             self._output_frames = []
         self._output_frames += frames
-        queue.count = queue.from_outputs = count
+        queue.count = count
+        queue.from_outputs = count
         self.result.taken += len(frames)
         return True
 
@@ -113,7 +117,8 @@ class Turns:
         """Return the bytes that the core has not processed, as arguments of Core.receive."""
         reads = self._reads
         esc = self._ports.input_of[reads.place[reads.at]]
-        return esc, bytes(reads.data[: reads.size]), self.times.now, reads.since
+        data = bytes(reads.data[: reads.size])
+        return esc, data, self.times.now, reads.since
 
     @property
     def has_advanced(self) -> bool:
@@ -143,7 +148,8 @@ class Turns:
 
     def entries(self) -> Iterator[tuple[int, int, int, bytes, int | None]]:
         """Yield the recorded calls in their order: time, kind, ESC, data, since when it can be."""
-        at, raw = _ENTRIES, self._raw
+        at = _ENTRIES
+        raw = self._raw
         end = at + self.result.recorded
         while at < end:
             now, came, size, kind, esc = _ENTRY.unpack_from(raw, at)
