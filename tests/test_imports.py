@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 
-LIVE = encode(LiveData(electrical_speed=12_345, battery_voltage=2442), Layout.V4)
+LIVE = encode(LiveData(electrical_speed=12_345, battery_voltage=2442), WireLayout.V4)
 STANDIN = Path(__file__).resolve().parent / "benchmarks"
 
 CANTOOLS = {"cantools", "argparse_addons", "bitstruct", "textparser", "crccheck", "diskcache"}

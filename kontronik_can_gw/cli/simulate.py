@@ -18,7 +18,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     ErrorWindow,
     EscOptions,
     Faults,
-    Layout,
+    WireLayout,
     OperatingError,
     SelfTestError,
     SimulatedEsc,
@@ -155,7 +155,7 @@ def main(args: argparse.Namespace) -> int:
     device = args.device or ("jivepro" if args.layout == "legacy" else "kosmik")
     options = EscOptions(
         device=_DEVICES[device],
-        layout=None if args.layout is None else Layout(args.layout),
+        layout=None if args.layout is None else WireLayout(args.layout),
         faults=Faults(flipped_bits=args.flip_bits, dropout=args.dropout, errors=tuple(args.error)),
     )
     # their starts are spread over the period, because real ESCs are not synchronized

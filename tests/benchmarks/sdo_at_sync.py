@@ -20,7 +20,7 @@ from pathlib import Path
 from programs import CANOPEN, new_bus, standin, started, write_config
 
 from kontronik_can_gw.desk.pty import PtyEsc
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 
 _FRAME = struct.Struct("=IB3x8s")
@@ -84,7 +84,7 @@ def measure(
     lives = []
     for n in range(100):
         data = LiveData(electrical_speed=n, battery_voltage=2442 + n % 7, battery_current=n % 50)
-        lives.append(encode(data, Layout.V4))
+        lives.append(encode(data, WireLayout.V4))
     start = time.monotonic()
     next_sync = next_live = next_request = start
     latencies: list[float] = []

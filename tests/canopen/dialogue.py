@@ -83,12 +83,12 @@ QUIET: Changes = {**NO_HEARTBEAT, **NO_PDOS}
 
 def live(**fields: int) -> bytes:
     """Return a live frame of the V4 layout. Fields that are not given are 0."""
-    return codec.encode(LiveData(**fields), codec.Layout.V4)
+    return codec.encode(LiveData(**fields), codec.WireLayout.V4)
 
 
 def info(**fields: int) -> bytes:
     """Return an info frame of the V4 layout."""
-    return codec.encode(InfoData(**fields), codec.Layout.V4)
+    return codec.encode(InfoData(**fields), codec.WireLayout.V4)
 
 
 class Bench(Talker):

@@ -9,7 +9,7 @@ import pytest
 from dialogue import QUIET, Bench, shipped_eds
 
 from kontronik_can_gw.canopen.eds import Entry
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode as uart
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.status import GatewayState
@@ -173,8 +173,8 @@ def fed(behaviour: int = 0) -> Bench:
     bench = Bench(changes=QUIET)
     assert bench.write(0x2100, 5, behaviour, size=1) is None
     bench.wait(10)
-    bench.uart(uart(INFO, Layout.V4))
-    bench.uart(uart(LIVE, Layout.V4))
+    bench.uart(uart(INFO, WireLayout.V4))
+    bench.uart(uart(LIVE, WireLayout.V4))
     bench.take()
     return bench
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from command_line import refused, run
 
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.deframer import Deframer, Frame
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
@@ -44,7 +44,7 @@ def test_a_file_and_standard_output_get_the_simulators_bytes(tmp_path: Path) -> 
     assert len(set(contents)) == 3
     for data in contents:
         layouts = {frame.layout for frame in frames_of(data)}
-        assert layouts == {Layout.LEGACY}
+        assert layouts == {WireLayout.LEGACY}
 
 
 def test_error_bits_and_the_device_are_as_requested(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from kontronik_can_gw.assembly.assemble import Loaded, assemble
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.frames import CanFrame, block_of
 from kontronik_can_gw.gateway.gateway import Gateway
@@ -148,7 +148,7 @@ class Bench:
 
     def hear(self, data: LiveData | InfoData, esc: int = 0) -> None:
         """Receive a frame of an ESC."""
-        self.gateway.receive_bytes(esc, encode(data, Layout.V4), self.now, self.now)
+        self.gateway.receive_bytes(esc, encode(data, WireLayout.V4), self.now, self.now)
 
     def take(self) -> None:
         for frame in self.gateway.take_frames(self.now):

@@ -24,7 +24,7 @@ from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import protocols
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.esc.values import VALUES, Group, values_of
@@ -82,7 +82,7 @@ class Flight:
 
 FRAME = frame(20, 2_400, 1_234, 55, 210)
 OLD_LIVE = LiveData(electrical_speed=9_000, battery_voltage=2_500, battery_current=-5)
-OLD = encode(OLD_LIVE, Layout.V4)
+OLD = encode(OLD_LIVE, WireLayout.V4)
 
 
 def test_values_of_both_protocols_are_sent() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.esc.decoder import ErrorBit, bit_texts
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.deframer import Deframer, Frame
 from kontronik_can_gw.esc.kontronik.fields import (
     Data,
@@ -70,10 +70,10 @@ def frame_in(wire: bytes) -> Frame:
 @pytest.mark.parametrize(("wire", "data"), RECORDED.items(), ids=["live", "info"])
 def test_recorded_frame_has_the_stated_values(wire: bytes, data: Data) -> None:
     found = frame_in(wire)
-    assert found.layout == Layout.LEGACY
+    assert found.layout == WireLayout.LEGACY
     assert type(found.data) is type(data)
     assert found.data == data
-    assert encode(data, Layout.LEGACY) == wire
+    assert encode(data, WireLayout.LEGACY) == wire
 
 
 @form_rows
@@ -89,7 +89,7 @@ def test_raw_values_survive_a_round_trip_with_any_reserved_bytes(
     body = b""
     for field in fields:
         body += struct.pack("<" + field.code, getattr(data, field.name))
-    sent = encode(data, Layout(row.layout))
+    sent = encode(data, WireLayout(row.layout))
     assert sent == reference.seal(row, body + bytes(size))
     assert frame_in(sent).form is form_of(row)
     for field in fields:
@@ -118,7 +118,7 @@ def test_changed_unprotected_byte_is_delivered_and_maybe_suspect(
         expected = value - 256 if name == "max_bec_temperature" and value > 127 else value
         assert found.data == RECORDED[frame]._replace(**{name: expected})
         assert found.is_suspect == (name == "operating_state" and value > 26)
-    assert not frame_in(encode(LiveData(operating_state=255), Layout.V4)).is_suspect
+    assert not frame_in(encode(LiveData(operating_state=255), WireLayout.V4)).is_suspect
 
 
 def test_field_has_type_unit_step_and_absence_of_the_sheet() -> None:

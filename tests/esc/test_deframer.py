@@ -13,7 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.esc.kontronik import deframer
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 
@@ -252,8 +252,8 @@ DIAGNOSES: list[tuple[str, list[bytes]]] = [
 ]
 BEFORE = (
     b"",
-    encode(LiveData(), Layout.V4),
-    encode(InfoData(), Layout.V4),
+    encode(LiveData(), WireLayout.V4),
+    encode(InfoData(), WireLayout.V4),
     BAD + b"KODX",
     bytes(64),
 )

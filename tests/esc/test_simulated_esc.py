@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.deframer import Deframer, Frame
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.simulator import (
@@ -48,7 +48,7 @@ phases = st.builds(
 any_options = st.builds(
     EscOptions,
     device=st.sampled_from(Device),
-    layout=st.sampled_from([None, *Layout]),
+    layout=st.sampled_from([None, *WireLayout]),
     period_ns=st.integers(1_000_000, 10 * S),
     info_every=st.integers(0, 20),
     profile=st.lists(phases, min_size=1, max_size=6).map(tuple),
@@ -103,11 +103,11 @@ def test_flight_is_physically_plausible(device: Device) -> None:
 @pytest.mark.parametrize(
     ("layout", "covered"),
     [
-        (Layout.V4, 36),
-        (Layout.LEGACY, 32),
+        (WireLayout.V4, 36),
+        (WireLayout.LEGACY, 32),
     ],
 )
-def test_receiver_finds_exactly_the_intact_frames(layout: Layout, covered: int) -> None:
+def test_receiver_finds_exactly_the_intact_frames(layout: WireLayout, covered: int) -> None:
     """In the legacy layout, frames with flipped bits outside the CRC are found as well."""
     options = EscOptions(layout=layout, faults=Faults(flipped_bits=0.001))
     frames = SimulatedEsc(options).frames_until(60 * S)
@@ -128,16 +128,16 @@ def test_requested_error_bits_and_swapped_devices_are_sent() -> None:
     )
     swaps = (
         Swap(20 * S, Device.JIVEPRO),
-        Swap(30 * S, Device.UHV, Layout.LEGACY),
+        Swap(30 * S, Device.UHV, WireLayout.LEGACY),
     )
     esc = SimulatedEsc(EscOptions(faults=Faults(errors=errors, swaps=swaps)))
     frames = esc.frames_until(40 * S)
     assert esc.device == Device.UHV
-    assert esc.layout == Layout.LEGACY
+    assert esc.layout == WireLayout.LEGACY
     for sent, frame in zip(frames, received(frames), strict=True):
         at = sent.time_ns / S
         data = sent.data
-        assert frame.layout is (Layout.V4 if at < 20 else Layout.LEGACY)
+        assert frame.layout is (WireLayout.V4 if at < 20 else WireLayout.LEGACY)
         if isinstance(data, LiveData):
             others = data.operating_errors & ~(1 << OperatingError.PROGRAMMING_ALLOWED)
             undervoltage = 5 <= at < 7

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from esc.reference import SHORTEST_FIRST, fits
 from esc.streams import decoded, form_of, random_stream
 from kontronik_can_gw.core.esc_stream import EscStream
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import Data, InfoData, LiveData, device_and_variant
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
@@ -30,20 +30,20 @@ LIVE = LiveData(
     battery_current=100,
     operating_state=21,
 )
-BAD = bytearray(encode(LIVE, Layout.V4))
+BAD = bytearray(encode(LIVE, WireLayout.V4))
 BAD[10] ^= 1
 BROKEN = bytes(BAD)
 """A frame whose CRC fails."""
 NOISE = b"\x55" * 20
 
 
-def live(speed: int = 21_000, layout: Layout = Layout.V4) -> bytes:
+def live(speed: int = 21_000, layout: WireLayout = WireLayout.V4) -> bytes:
     return encode(LIVE._replace(electrical_speed=speed), layout)
 
 
 def info() -> bytes:
     known = device_and_variant(Device.KOSMIK, 120)
-    return encode(InfoData(device_and_variant=known, cell_count=6), Layout.V4)
+    return encode(InfoData(device_and_variant=known, cell_count=6), WireLayout.V4)
 
 
 def esc(timeout_ns: int = TIMEOUT) -> EscStream:
@@ -163,7 +163,7 @@ def test_frame_with_a_first_byte_older_than_the_time_out_is_dropped(gap: int, ta
 def test_frames_in_old_bytes_are_counted_as_late_and_not_shown() -> None:
     telemetry = esc(timeout_ns=100 * MS)
     # The frame is complete, but the header before it could still begin a frame of 44 bytes.
-    hidden = b"KODI" + live(5, Layout.LEGACY)
+    hidden = b"KODI" + live(5, WireLayout.LEGACY)
     read(telemetry, hidden, SECOND)
     assert telemetry.live is None
     read(telemetry, b"", SECOND + 100 * MS + 1)

@@ -15,12 +15,12 @@ from harness import Bench, PtyPort
 from signals import table_sent
 from slcan_adapters import Bus
 
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.states import Device
 
 WITHOUT_OVERRIDE = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")
 """Command prefix for a root process that file permissions apply to."""
-IDENTITIES = (Identity(1), Identity(2, Layout.LEGACY, Device.JIVEPRO, 12, alarms=True))
+IDENTITIES = (Identity(1), Identity(2, WireLayout.LEGACY, Device.JIVEPRO, 12, alarms=True))
 ADAPTER_RATE = 500_000
 table = functools.cache(table_sent)
 """Return the table of a shipped layout. It is computed once."""
@@ -82,7 +82,7 @@ def everything(folder: Path) -> contextlib.AbstractContextManager[Bench]:
 
 def eight(_: Path) -> contextlib.AbstractContextManager[Bench]:
     """Return a bench with eight slow ESCs. Feeder and judge need the processor, too."""
-    layouts = (Layout.V4, Layout.LEGACY)
+    layouts = (WireLayout.V4, WireLayout.LEGACY)
     identities = [Identity(i + 1, layouts[i % 2]) for i in range(8)]
     return bench_of(identities, rate_hz=25, canopen=False)
 

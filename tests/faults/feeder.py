@@ -24,7 +24,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 from esc import sheet
 
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
 from kontronik_can_gw.esc.kontronik.states import Device
 
@@ -43,7 +43,7 @@ class Identity(NamedTuple):
     """The ESC on a line. Each ESC has a different ``salt``, so its values differ."""
 
     salt: int = 1
-    layout: Layout = Layout.V4
+    layout: WireLayout = WireLayout.V4
     device: Device = Device.KOSMIK
     cells: int = 6
     alarms: bool = False

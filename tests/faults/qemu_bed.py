@@ -24,7 +24,7 @@ from feeder import FedEsc, Identity
 from harness import Bench
 from qemu_adapter import SerialAdapter, wait_until
 
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.states import Device
 
 WIRE = 0
@@ -218,8 +218,8 @@ class MachineBench(Bench):
 
     def __init__(self) -> None:
         self._gateway = None  # the feeder reads it before it is set
-        self.wire = WirePort(Identity(2, Layout.LEGACY, Device.JIVEPRO, 12))
-        self.uart = FarPort(Identity(1, Layout.V4), self._has_open)
+        self.wire = WirePort(Identity(2, WireLayout.LEGACY, Device.JIVEPRO, 12))
+        self.uart = FarPort(Identity(1, WireLayout.V4), self._has_open)
         for name in ("can0", "can1"):
             can_up(name)
         known = table(("--esc", "2"), True, 2)

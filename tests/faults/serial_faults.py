@@ -13,7 +13,7 @@ from beds import fault
 from feeder import Identity
 from harness import Bench, Injection, PtyPort
 
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.states import Device
 
 LOST = 4
@@ -205,8 +205,8 @@ def off(bench: Bench, injection: Injection, seconds: float) -> None:
 
 
 MODELS = (
-    Identity(11, Layout.LEGACY, Device.JIVEPRO, 12),
-    Identity(12, Layout.V4, Device.KOLIBRI, 3),
+    Identity(11, WireLayout.LEGACY, Device.JIVEPRO, 12),
+    Identity(12, WireLayout.V4, Device.KOLIBRI, 3),
     Identity(1),
 )
 

@@ -7,7 +7,7 @@ import pytest
 from bus_watch import MS, SECOND, Judge
 from feeder import CURRENT, SPEED, FedEsc, Identity, live, mix
 
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 
 START = 100 * SECOND
 PERIOD = 20 * MS
@@ -19,7 +19,7 @@ LINK_ID = 0x6B0
 @pytest.fixture
 def judge() -> Judge:
     """Return a judge with two ESCs that have sent fifty frames each, 20 ms apart."""
-    escs = [FedEsc(Identity(1)), FedEsc(Identity(2, Layout.LEGACY))]
+    escs = [FedEsc(Identity(1)), FedEsc(Identity(2, WireLayout.LEGACY))]
     for esc in escs:
         for n in range(50):
             esc.note(START + n * PERIOD)

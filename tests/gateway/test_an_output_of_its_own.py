@@ -145,7 +145,7 @@ def test_a_further_output_sends_values_and_receives_commands() -> None:
         while gateway.next_deadline() < now:
             gateway.advance(gateway.next_deadline())
         if now < 2 * SECOND:
-            wire = encode(LiveData(battery_voltage=2400), codec.Layout.V4)
+            wire = encode(LiveData(battery_voltage=2400), codec.WireLayout.V4)
             gateway.receive_bytes(1, wire, now, now)
         gateway.advance(now)
         for frame in gateway.take_frames(now):

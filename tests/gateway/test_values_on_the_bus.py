@@ -25,7 +25,7 @@ def text_of(signal: Sig, more: str = EVENT) -> str:
 
 
 def wire(**values: int) -> bytes:
-    return encode(LiveData(**values), codec.Layout.V4)
+    return encode(LiveData(**values), codec.WireLayout.V4)
 
 
 class Bench:
@@ -43,7 +43,7 @@ class Bench:
 
     def info(self, device: Device) -> None:
         info = InfoData(device_and_variant=device_and_variant(device, 120), cell_count=6)
-        self.read(encode(info, codec.Layout.V4))
+        self.read(encode(info, codec.WireLayout.V4))
 
     def read(self, data: bytes) -> list[bytes]:
         """Receive bytes after one period. Return the frames sent until then and because of them."""

@@ -28,7 +28,7 @@ from vcan_tools import GatewayProcess
 from kontronik_can_gw.desk import metrics as metrics_module
 from kontronik_can_gw.desk.libraries import EXTRAS, install_command
 from kontronik_can_gw.desk.monitor.status import look_at
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.runtime.status.facts import CanFacts, PortFacts, StoreFacts
@@ -149,7 +149,7 @@ def test_error_bits_have_a_severity_and_unknown_ones_are_shown_if_set() -> None:
     bench = Bench(1)
     bench.run(3)
     errors = LiveData(operating_errors=1 << OperatingError.OVERVOLTAGE | 1 << 30)
-    bench.gateway.receive_bytes(0, encode(errors, Layout.V4), bench.now, bench.now)
+    bench.gateway.receive_bytes(0, encode(errors, WireLayout.V4), bench.now, bench.now)
     found = families(bench.document())
     samples = found["kontronik_operating_error"].samples
     severities = {}

@@ -33,7 +33,7 @@ from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.core.output_setup import OutputSetup, ReadyOutput
 from kontronik_can_gw.dronecan.node_setup import Given
 from kontronik_can_gw.dronecan.setup import DronecanSetup
-from kontronik_can_gw.esc.kontronik.codec import Layout as WireLayout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings, Event

@@ -176,7 +176,7 @@ def test_settings_beyond_the_limits_make_speeds_not_available() -> None:
         gateway.core.apply(0, given)
         assert gateway.escs[0].settings == given
         time = now * SECOND // 10
-        live = encode(LiveData(electrical_speed=70_000), codec.Layout.V4)
+        live = encode(LiveData(electrical_speed=70_000), codec.WireLayout.V4)
         gateway.receive_bytes(0, live, time, time)
         (frame,) = gateway.take_frames(time)
         assert struct.unpack("<2I", frame.data) == (motor, output), given

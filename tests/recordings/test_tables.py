@@ -36,7 +36,7 @@ from kontronik_can_gw.desk.recordings.fields import (
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.recording import Block
 from kontronik_can_gw.desk.recordings.samples import RowMaker
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.status import GatewayStatus
@@ -222,7 +222,7 @@ def test_the_age_of_an_esc_that_is_lost_goes_on_in_the_rows_of_another() -> None
     fields = fields_of_values([esc.settings for esc in escs])
     ages = [index for index, one in enumerate(fields) if one.source == "data_age"]
     maker = RowMaker([fields[index] for index in ages], escs, GatewayStatus(), 0)
-    wire = encode(LiveData(), Layout.V4)
+    wire = encode(LiveData(), WireLayout.V4)
     for now in range(SECOND, 3 * SECOND, 100 * MS):
         for number, esc in enumerate(escs):
             if number == 0 or now == SECOND:

@@ -13,7 +13,7 @@ from wire_world import CAN_FD, Bus, World
 from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
@@ -312,7 +312,7 @@ def test_a_bus_that_was_stalled_gets_no_backlog(
     bench.start()
     bench.gateway.receive_bytes(
         0,
-        encode(LiveData(battery_voltage=2400), Layout.V4),
+        encode(LiveData(battery_voltage=2400), WireLayout.V4),
         bench.now,
         bench.now,
     )
@@ -445,7 +445,7 @@ def test_no_frame_is_sent_in_bus_off(
     kernel.facts = facts
     made.error_frame(CanState.BUS_OFF)
     made.turn(950)
-    made.gateway.receive_bytes(0, encode(LiveData(1, 2442), Layout.V4), made.now, made.now)
+    made.gateway.receive_bytes(0, encode(LiveData(1, 2442), WireLayout.V4), made.now, made.now)
     made.turn(10)
     assert made.take() == []
     kernel.facts = after

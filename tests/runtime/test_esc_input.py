@@ -34,7 +34,7 @@ from kontronik_can_gw.times import MS, SECOND
 
 LEFT = Identity(0x403, 0x6001, "A1", "1.0")
 RIGHT = Identity(0x403, 0x6001, "B2", "1.0")
-LIVE = codec.encode(LiveData(battery_voltage=2442), codec.Layout.V4)
+LIVE = codec.encode(LiveData(battery_voltage=2442), codec.WireLayout.V4)
 
 
 class Port(Wire):

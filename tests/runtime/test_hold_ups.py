@@ -801,7 +801,7 @@ def test_an_error_of_the_esc_in_a_hold_up_precedes_the_loss(bench: Bench) -> Non
     start = bench.world.now
     wire = bench.wire
     for at in range(10, 300, 10):
-        data = codec.encode(LiveData(operating_errors=1 << 0), codec.Layout.V4)
+        data = codec.encode(LiveData(operating_errors=1 << 0), codec.WireLayout.V4)
         first = start + at * MS
         wire.put(data, [first + n * NS_PER_BYTE for n in range(1, len(data) + 1)])
     bench.hold_up(300 * MS)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from statistics_bench import Bench, moment_of
 
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.deframer import Counters
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
@@ -105,7 +105,7 @@ def test_errors_warnings_and_statuses_are_separate() -> None:
         | 1 << OperatingError.PROGRAMMING_ALLOWED
         | 1 << 31
     )
-    frame = encode(LiveData(operating_errors=word), Layout.V4)
+    frame = encode(LiveData(operating_errors=word), WireLayout.V4)
     bench.gateway.receive_bytes(0, frame, bench.now, bench.now)
     (shown,) = bench.document()["escs"]
     assert shown["errors"] == ["undervoltage", "bit31"]

@@ -19,7 +19,7 @@ from cantools.database.can import Database
 from esc import sheet
 
 from kontronik_can_gw.core.esc_stream import EscStream
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.status import CanState, GatewayState, GatewayStatus
@@ -833,7 +833,7 @@ def random_escs(
     escs = [EscStream(each, now) for each in settings]
     for _ in range(rng.randint(0, 3)):
         for esc in escs:
-            layout = rng.choice((Layout.V4, Layout.LEGACY))
+            layout = rng.choice((WireLayout.V4, WireLayout.LEGACY))
             if rng.random() < 0.7:
                 live = encode(random_live(rng), layout)
                 list(esc.receive_each(live, now, now))

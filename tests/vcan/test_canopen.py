@@ -9,7 +9,7 @@ import canopen
 from feeder import Identity
 from vcan_tools import EDS, LIMIT_S, canopen_table, chain, wait_for
 
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 
 BOOT_UP = 0
 STATES = {"OPERATIONAL": 5, "STOPPED": 4, "PRE-OPERATIONAL": 127}
@@ -30,7 +30,7 @@ def master_on(interface: str) -> Iterator[Any]:
 
 
 def test_nmt_commands_change_states_and_heartbeats_show_them(vcan: str, tmp_path: Path) -> None:
-    identities = Identity(1), Identity(2, Layout.LEGACY, cells=12)
+    identities = Identity(1), Identity(2, WireLayout.LEGACY, cells=12)
     toml = canopen_table(tmp_path / "store")
     with (
         chain(vcan, tmp_path, *identities, toml=toml) as run,

@@ -10,14 +10,14 @@ import pytest
 from feeder import Identity
 from vcan_tools import chain, wait_for
 
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.states import Device
 
 LINK_THERE = (2, 3)
 """States Ok and Degraded. A link is Degraded if its ESC waits for the bus to show each frame."""
 LINK_LOST = 4
 STOPPING = 2
-LAYOUTS = (Layout.V4, Layout.LEGACY)
+LAYOUTS = (WireLayout.V4, WireLayout.LEGACY)
 EIGHT = [Identity(i + 1, LAYOUTS[i % 2], cells=6 + i, alarms=i > 5) for i in range(8)]
 
 
@@ -25,7 +25,7 @@ EIGHT = [Identity(i + 1, LAYOUTS[i % 2], cells=6 + i, alarms=i > 5) for i in ran
     ("identities", "times", "number"),
     [
         ([Identity(1)], 150, signal.SIGTERM),
-        ([Identity(2, Layout.LEGACY, Device.JIVEPRO, 12, alarms=True)], 300, signal.SIGINT),
+        ([Identity(2, WireLayout.LEGACY, Device.JIVEPRO, 12, alarms=True)], 300, signal.SIGINT),
         (EIGHT, 40, signal.SIGTERM),
     ],
     ids=["KOSMIK", "JIVEPRO", "eight"],

@@ -8,7 +8,7 @@ installation compiles the core before it installs anything.
 import struct
 from collections.abc import Iterator
 
-from kontronik_can_gw.esc.kontronik.codec import FORMS, MAX_LENGTH, MIN_LENGTH, Form, Layout
+from kontronik_can_gw.esc.kontronik.codec import FORMS, MAX_LENGTH, MIN_LENGTH, Form, WireLayout
 from kontronik_can_gw.esc.kontronik.fields import (
     VARIANT_BITS,
     DataType,
@@ -70,10 +70,10 @@ def _sizes() -> str:
 
 
 def _forms() -> str:
-    live_legacy = _form(False, Layout.LEGACY)
-    live_v4 = _form(False, Layout.V4)
-    info_legacy = _form(True, Layout.LEGACY)
-    info_v4 = _form(True, Layout.V4)
+    live_legacy = _form(False, WireLayout.LEGACY)
+    live_v4 = _form(False, WireLayout.V4)
+    info_legacy = _form(True, WireLayout.LEGACY)
+    info_v4 = _form(True, WireLayout.V4)
     return (
         "/* Frame length and bytes that the CRC covers, by [is info][is V4]. */\n"
         "#define KCG_FRAME_FORMS \\\n"
@@ -81,7 +81,7 @@ def _forms() -> str:
     )
 
 
-def _form(is_info: bool, layout: Layout) -> str:
+def _form(is_info: bool, layout: WireLayout) -> str:
     def matches(form: Form) -> bool:
         return form.is_info is is_info and form.layout is layout
 

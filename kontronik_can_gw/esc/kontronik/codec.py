@@ -19,7 +19,7 @@ from kontronik_can_gw.esc.decoder import FrameForm
 from kontronik_can_gw.esc.kontronik.fields import Data, DataType, InfoData, LiveData, body_format
 
 
-class Layout(Enum):
+class WireLayout(Enum):
     """The two layouts of frames. Every device uses one of them for all its frames."""
 
     V4 = "v4"
@@ -29,18 +29,18 @@ class Layout(Enum):
 class Form(FrameForm):
     """One of the four frame forms: its header, length, CRC and packing."""
 
-    def __init__(self, is_info: bool, layout: Layout) -> None:
+    def __init__(self, is_info: bool, layout: WireLayout) -> None:
         self.layout = layout
         self.name = f"{'info' if is_info else 'live'}_{layout.value}"
         self.header = b"KODI" if is_info else b"KODL"
         self.data_type: DataType = InfoData if is_info else LiveData
         body = body_format(self.data_type)
         reserved = 0
-        if layout is Layout.V4:
+        if layout is WireLayout.V4:
             reserved = -struct.calcsize(f"<4s{body}") % 4
         self._struct = struct.Struct(f"<4s{body}{reserved}xI")
         length = self._struct.size
-        layout_number = list(Layout).index(layout) + 1
+        layout_number = list(WireLayout).index(layout) + 1
         super().__init__(length, is_info, layout_number)
         crc_at = length - 4
         self.covered = crc_at // 4 * 4
@@ -61,10 +61,10 @@ class Form(FrameForm):
 
 
 FORMS = (
-    Form(is_info=False, layout=Layout.LEGACY),
-    Form(is_info=False, layout=Layout.V4),
-    Form(is_info=True, layout=Layout.LEGACY),
-    Form(is_info=True, layout=Layout.V4),
+    Form(is_info=False, layout=WireLayout.LEGACY),
+    Form(is_info=False, layout=WireLayout.V4),
+    Form(is_info=True, layout=WireLayout.LEGACY),
+    Form(is_info=True, layout=WireLayout.V4),
 )
 """All four forms in the order of the search: the shorter one of each kind is first."""
 
@@ -78,7 +78,7 @@ MIN_LENGTH = min(form.length for form in FORMS)
 MAX_LENGTH = max(form.length for form in FORMS)
 
 
-def encode(data: Data, layout: Layout) -> bytes:
+def encode(data: Data, layout: WireLayout) -> bytes:
     """Return the frame with this data in the given layout.
 
     Raises struct.error if a value does not fit its wire type.

@@ -21,7 +21,7 @@ from kontronik_can_gw.esc.kontronik.codec import (
     FORMS_BY_HEADER,
     MAX_LENGTH,
     Form,
-    Layout,
+    WireLayout,
 )
 from kontronik_can_gw.esc.kontronik.fields import Data
 from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
@@ -44,7 +44,7 @@ class Frame(Reading):
     data: Data
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> WireLayout:
         return self.form.layout
 
     @property

@@ -17,7 +17,7 @@ from random import Random
 from typing import NamedTuple
 
 from kontronik_can_gw.esc.decoder import SECOND_NS as SECOND_NS
-from kontronik_can_gw.esc.kontronik.codec import Layout as Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout as WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import Data, InfoData, LiveData, device_and_variant, rows
 from kontronik_can_gw.esc.kontronik.states import Device as Device
@@ -257,7 +257,7 @@ class Swap(NamedTuple):
     time_ns: int
     """Counted from the start of the simulation."""
     device: Device
-    layout: Layout | None = None
+    layout: WireLayout | None = None
     """None: the usual layout of the device."""
 
 
@@ -278,7 +278,7 @@ class EscOptions:
     """The device and the way it sends."""
 
     device: Device = Device.KOSMIK
-    layout: Layout | None = None
+    layout: WireLayout | None = None
     """None: the usual layout of the device."""
     period_ns: int = 10_000_000
     """Time from one live frame to the next, 100 µs..10 s."""
@@ -288,12 +288,12 @@ class EscOptions:
     faults: Faults = field(default_factory=Faults)
 
 
-def usual_layout(device: Device) -> Layout:
+def usual_layout(device: Device) -> WireLayout:
     """Return the layout that the simulated device uses by default.
 
     It is legacy for the JIVEPro, as in recordings, and V4 for all others.
     """
-    return Layout.LEGACY if device is Device.JIVEPRO else Layout.V4
+    return WireLayout.LEGACY if device is Device.JIVEPRO else WireLayout.V4
 
 
 class Sent(NamedTuple):
@@ -370,7 +370,7 @@ class SimulatedEsc:
             self._frame_number += 1
             if options.info_every and self._frame_number % options.info_every == 0:
                 self._info_due = True
-                length = 40 if self.layout is Layout.V4 else 38
+                length = 40 if self.layout is WireLayout.V4 else 38
                 self.next_ns = now_ns + min(length * BYTE_NS, options.period_ns // 2)
         if self._faults.dropout is not None:
             duration, interval = self._faults.dropout
