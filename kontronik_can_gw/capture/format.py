@@ -20,7 +20,7 @@ damaged. The payload of a data block is a table, followed by the data of its ent
 
     u32      number of entries
     entries  16 bytes each: u64 time in ns of the recording machine's monotonic clock,
-             u8 kind (``Kind``), u8 flags, u16 index of the ESC, u32 length of its data
+             u8 kind (``EntryKind``), u8 flags, u16 index of the ESC, u32 length of its data
 
 Since version 2 the data of BYTES and FRAME begin with a u64 time on the clock of the entry. For
 BYTES it is a time before any of the bytes arrived, for FRAME the arrival of the CAN frame. Version
@@ -59,7 +59,7 @@ _REMOTE = 2
 _NUMBER = struct.Struct("<Q")
 
 
-class Kind(IntEnum):
+class EntryKind(IntEnum):
     """Kinds of entries. The data of an entry is described in brackets."""
 
     BYTES = 1
@@ -100,7 +100,7 @@ class Kind(IntEnum):
     """The process was delayed. flags 1: pending measurements were dropped."""
 
 
-_WITH_ARRIVAL = frozenset({Kind.BYTES, Kind.FRAME})
+_WITH_ARRIVAL = frozenset({EntryKind.BYTES, EntryKind.FRAME})
 
 
 class Entry(NamedTuple):

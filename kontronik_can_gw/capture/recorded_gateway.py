@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from operator import attrgetter
 from typing import Any
 
-from kontronik_can_gw.capture.format import COUNTERS, Kind, frame_data, numbers_data
+from kontronik_can_gw.capture.format import COUNTERS, EntryKind, frame_data, numbers_data
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.status import CanState, GatewayStatus
@@ -38,11 +38,11 @@ class RecordedGateway(Gateway):
         self._line_errors = [0] * len(self.escs)
 
     def start(self, now: int, can_open: bool = True) -> None:
-        self._note(now, Kind.START, flags=int(can_open))
+        self._note(now, EntryKind.START, flags=int(can_open))
         super().start(now, can_open)
 
     def stop(self, now: int) -> None:
-        self._note(now, Kind.STOP)
+        self._note(now, EntryKind.STOP)
         super().stop(now)
 
     def receive_bytes(
@@ -52,53 +52,53 @@ class RecordedGateway(Gateway):
         now: int,
         since: int,
     ) -> None:
-        self._note(now, Kind.BYTES, esc, data, came=since)
+        self._note(now, EntryKind.BYTES, esc, data, came=since)
         super().receive_bytes(esc, data, now, since)
 
     def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
         self._note_line_errors(now)
         data = frame_data(frame)
-        self._note(now, Kind.FRAME, data=data, came=at)
+        self._note(now, EntryKind.FRAME, data=data, came=at)
         super().receive_frame(frame, now, at)
 
     def held_up(self, now: int, dropped: bool) -> None:
-        self._note(now, Kind.HELD_UP, flags=int(dropped))
+        self._note(now, EntryKind.HELD_UP, flags=int(dropped))
         super().held_up(now, dropped)
 
     def can_opened(self, now: int) -> None:
-        self._note(now, Kind.CAN_OPENED)
+        self._note(now, EntryKind.CAN_OPENED)
         super().can_opened(now)
 
     def receive_overrun(self, now: int) -> None:
-        self._note(now, Kind.OVERRUN)
+        self._note(now, EntryKind.OVERRUN)
         super().receive_overrun(now)
 
     def saved(self, esc: int, error: str | None, now: int) -> None:
         has_failed = error is not None
         reason = (error or "").encode()
-        self._note(now, Kind.SAVED, esc, reason, flags=int(has_failed))
+        self._note(now, EntryKind.SAVED, esc, reason, flags=int(has_failed))
         super().saved(esc, error, now)
 
     def parameters_damaged(self, esc: int, now: int) -> None:
-        self._note(now, Kind.DAMAGED, esc)
+        self._note(now, EntryKind.DAMAGED, esc)
         super().parameters_damaged(esc, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
-        self._note(now, Kind.PORT_OPENED if is_open else Kind.PORT_LOST, esc)
+        self._note(now, EntryKind.PORT_OPENED if is_open else EntryKind.PORT_LOST, esc)
         super().port(esc, is_open, now)
 
     def can_returned(self, now: int) -> None:
-        self._note(now, Kind.CAN_RETURNED)
+        self._note(now, EntryKind.CAN_RETURNED)
         super().can_returned(now)
 
     def set_can_state(self, state: CanState, now: int) -> None:
-        self._note(now, Kind.CAN_STATE, flags=int(state))
+        self._note(now, EntryKind.CAN_STATE, flags=int(state))
         super().set_can_state(state, now)
 
     def advance(self, now: int, with_core: bool = True) -> None:
         if with_core:  # otherwise the core's own call was recorded
             self._note_line_errors(now)
-            self._note(now, Kind.ADVANCE)
+            self._note(now, EntryKind.ADVANCE)
         super().advance(now, with_core)
 
     def take_frames(self, now: int) -> list[CanFrame]:
@@ -107,7 +107,7 @@ class RecordedGateway(Gateway):
         return frames
 
     def not_sent(self, now: int) -> None:
-        self._put(now, Kind.NOT_SENT, 0, b"", 0, None)
+        self._put(now, EntryKind.NOT_SENT, 0, b"", 0, None)
 
     def prepare_turns(self, now: int) -> None:
         """Record counters and line errors before turns in C call the core."""
@@ -131,12 +131,12 @@ class RecordedGateway(Gateway):
             if line_errors != self._line_errors[index]:
                 self._line_errors[index] = line_errors
                 data = numbers_data(line_errors)
-                self._put(now, Kind.LINE_ERRORS, index, data, 0, None)
+                self._put(now, EntryKind.LINE_ERRORS, index, data, 0, None)
 
     def _note(
         self,
         now: int,
-        kind: Kind,
+        kind: EntryKind,
         esc: int = 0,
         data: bytes = b"",
         flags: int = 0,
@@ -150,7 +150,7 @@ class RecordedGateway(Gateway):
         if counters != self._counters:
             self._counters = counters
             data = numbers_data(*counters)
-            self._put(now, Kind.COUNTERS, 0, data, 0, None)
+            self._put(now, EntryKind.COUNTERS, 0, data, 0, None)
 
 
 def state_of(gateway: Gateway) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.capture.format import (
     COUNTERS,
     Entry,
-    Kind,
+    EntryKind,
     read_frame,
     read_json,
     read_numbers,
@@ -70,7 +70,7 @@ class Replay:
 
         Returns the frames that were sent before it, and the frame that was received with it.
         """
-        if entry.kind == Kind.NOT_SENT:
+        if entry.kind == EntryKind.NOT_SENT:
             self._taken = []
             return []
         found = self._taken
@@ -87,7 +87,7 @@ class Replay:
         """True while the next entry decides whether the frames of the last turn were sent."""
         return bool(self._taken)
 
-    def go_on(self, taken: list[TimedFrame]) -> None:
+    def add_frames(self, taken: list[TimedFrame]) -> None:
         """Continue after a player. ``taken``: the frames of its last turn on this gateway."""
         self._taken += taken
 
@@ -104,40 +104,40 @@ class Replay:
             came = now
         check_time(came)
         gateway = self.gateway
-        if not self._started and kind == Kind.ADVANCE:  # the beginning of the run is missing
+        if not self._started and kind == EntryKind.ADVANCE:  # the beginning of the run is missing
             self._midway = True
             self._start(now, True)
-        if kind == Kind.BYTES:
+        if kind == EntryKind.BYTES:
             gateway.receive_bytes(esc, data, now, came)
-        elif kind == Kind.ADVANCE:
+        elif kind == EntryKind.ADVANCE:
             gateway.advance(now)
             self._collect_frames(now)
-        elif kind == Kind.FRAME:
+        elif kind == EntryKind.FRAME:
             frame = read_frame(data)
             gateway.receive_frame(frame, now, came)
             return [TimedFrame(now, frame, True)]
-        elif kind == Kind.START:
+        elif kind == EntryKind.START:
             self._start(now, bool(flags))
             self._collect_frames(now)
-        elif kind == Kind.STOP:
+        elif kind == EntryKind.STOP:
             gateway.stop(now)
             self._collect_frames(now)
-        elif kind == Kind.COUNTERS:
+        elif kind == EntryKind.COUNTERS:
             counters = read_numbers(data)
             check_counters(counters)
             for name, value in zip(COUNTERS, counters, strict=True):
                 setattr(gateway.status, name, value)
-        elif kind == Kind.LINE_ERRORS:
+        elif kind == EntryKind.LINE_ERRORS:
             (gateway.escs[esc].line_errors,) = read_numbers(data)
-        elif kind == Kind.LOST:
+        elif kind == EntryKind.LOST:
             self.lost += sum(read_numbers(data))
-        elif kind == Kind.STATE:
+        elif kind == EntryKind.STATE:
             if self._midway:
                 self._midway = False
                 state = read_json(data)
                 check_state(state)
                 self._adopt(state)
-        elif kind != Kind.CLOCK:
+        elif kind != EntryKind.CLOCK:
             _repeat_rare(gateway, entry)
         return []
 
@@ -178,26 +178,26 @@ def _repeat_rare(gateway: Gateway, entry: Entry) -> None:
     now = entry.time_ns
     esc = entry.esc
     match entry.kind:
-        case Kind.PORT_OPENED:
+        case EntryKind.PORT_OPENED:
             gateway.port(esc, True, now)
-        case Kind.PORT_LOST:
+        case EntryKind.PORT_LOST:
             gateway.port(esc, False, now)
-        case Kind.CAN_OPENED:
+        case EntryKind.CAN_OPENED:
             gateway.can_opened(now)
-        case Kind.CAN_RETURNED:
+        case EntryKind.CAN_RETURNED:
             gateway.can_returned(now)
-        case Kind.HELD_UP:
+        case EntryKind.HELD_UP:
             gateway.held_up(now, bool(entry.flags))
-        case Kind.CAN_STATE:
+        case EntryKind.CAN_STATE:
             gateway.set_can_state(CanState(entry.flags), now)
-        case Kind.OVERRUN:
+        case EntryKind.OVERRUN:
             gateway.receive_overrun(now)
-        case Kind.SAVED:
+        case EntryKind.SAVED:
             error = None
             if entry.flags:
                 error = entry.data.decode("utf-8", "replace")
             gateway.saved(esc, error, now)
-        case Kind.DAMAGED:
+        case EntryKind.DAMAGED:
             gateway.parameters_damaged(esc, now)
         case unknown:
             raise KeyError(unknown)

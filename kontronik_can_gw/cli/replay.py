@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
-from kontronik_can_gw.capture.format import Kind
+from kontronik_can_gw.capture.format import EntryKind
 from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.desk import given_layout, reading, terminals
@@ -239,7 +239,7 @@ def _on_pty(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str
     with terminals(names, args.link) as opened:
         pace.stopped.wait(args.delay)
         for entry in recording.entries():
-            if entry.kind != Kind.BYTES:
+            if entry.kind != EntryKind.BYTES:
                 continue
             if not pace.wait(entry.time_ns):
                 break

@@ -18,10 +18,10 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     ErrorWindow,
     EscOptions,
     Faults,
-    WireLayout,
     OperatingError,
     SelfTestError,
     SimulatedEsc,
+    WireLayout,
 )
 from kontronik_can_gw.times import SECOND
 

@@ -18,7 +18,7 @@ _TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
 }
 
 
-class Kind(NamedTuple):
+class KeyKind(NamedTuple):
     """The values that a key accepts."""
 
     span: str
@@ -29,7 +29,7 @@ class Kind(NamedTuple):
     """Maps a value from TOML to the value in use, or raises ValueError with the mistake."""
 
 
-def key(kind: Kind, default: Any, doc: str) -> Any:
+def key(kind: KeyKind, default: Any, doc: str) -> Any:
     """Return the row of a table for one key: its kind, default and meaning."""
     metadata = {"kind": kind, "doc": doc}
     if isinstance(default, dict):
@@ -46,7 +46,7 @@ def _check_type(value: Any, name: str) -> Any:
     return value
 
 
-def _plain(span: str, problem: str = "", **schema: Any) -> Kind:
+def _plain(span: str, problem: str = "", **schema: Any) -> KeyKind:
     """Return the kind that a JSON Schema of one type describes.
 
     In the error, ``problem`` follows the refused value.
@@ -68,10 +68,10 @@ def _plain(span: str, problem: str = "", **schema: Any) -> Kind:
             raise ValueError(f"{value!r} {problem}")
         return value
 
-    return Kind(span, schema, check)
+    return KeyKind(span, schema, check)
 
 
-def integer(low: int, high: int, also: int | None = None) -> Kind:
+def integer(low: int, high: int, also: int | None = None) -> KeyKind:
     """Accept a whole number from ``low`` to ``high``, or the greater number ``also``."""
     schema: dict[str, Any] = {
         "type": "integer",
@@ -88,7 +88,7 @@ def integer(low: int, high: int, also: int | None = None) -> Kind:
     return _plain(span, problem, **schema)
 
 
-def number(low: float, high: float) -> Kind:
+def number(low: float, high: float) -> KeyKind:
     """Accept a number from ``low`` to ``high``."""
     problem = f"is outside {low}..{high}"
     return _plain(
@@ -105,7 +105,7 @@ def pattern(
     form: str,
     problem: str,
     **limits: int,
-) -> Kind:
+) -> KeyKind:
     """Accept a text that matches the regular expression ``form``.
 
     In the error, ``problem`` follows the refused text.
@@ -119,12 +119,12 @@ def pattern(
     )
 
 
-def choice(*choices: str) -> Kind:
+def choice(*choices: str) -> KeyKind:
     """Accept one of these texts."""
     return choice_of(lambda: choices)
 
 
-def choice_of(known: Callable[[], Sequence[str]], span: str = "") -> Kind:
+def choice_of(known: Callable[[], Sequence[str]], span: str = "") -> KeyKind:
     """Accept one of the texts that ``known`` returns at each check.
 
     The list may grow after import, as the list of devices does with another ESC protocol.
@@ -138,15 +138,15 @@ def choice_of(known: Callable[[], Sequence[str]], span: str = "") -> Kind:
         return str(text)
 
     span = span or ", ".join(f'"{text}"' for text in known())
-    return Kind(span, {"type": "string", "enum": list(known())}, check)
+    return KeyKind(span, {"type": "string", "enum": list(known())}, check)
 
 
-def meanings(known: Sequence[str]) -> Kind:
+def meanings(known: Sequence[str]) -> KeyKind:
     """Accept a table that maps each of the user's texts to one of the known texts."""
     return table_of(choice_of(lambda: known, "strings"))
 
 
-def table_of(kind: Kind) -> Kind:
+def table_of(kind: KeyKind) -> KeyKind:
     """Accept a table with any names, whose entries are all of one kind."""
 
     def check(value: Any) -> dict[str, Any]:
@@ -159,10 +159,10 @@ def table_of(kind: Kind) -> Kind:
         return checked
 
     span = f"table of {kind.span}"
-    return Kind(span, {"type": "object", "additionalProperties": kind.schema}, check)
+    return KeyKind(span, {"type": "object", "additionalProperties": kind.schema}, check)
 
 
-def options(path: str, own: frozenset[str]) -> Kind:
+def options(path: str, own: frozenset[str]) -> KeyKind:
     """Accept a table of texts, numbers and booleans.
 
     Refuses the names in ``own``, which are keys of the table ``path``.
@@ -174,7 +174,7 @@ def options(path: str, own: frozenset[str]) -> Kind:
         return value
 
     of_entry = {"type": ["string", "number", "boolean"]}
-    kind = table_of(Kind("strings, numbers or booleans", of_entry, entry))
+    kind = table_of(KeyKind("strings, numbers or booleans", of_entry, entry))
 
     def check(value: Any) -> Any:
         checked = kind.check(value)
@@ -185,7 +185,7 @@ def options(path: str, own: frozenset[str]) -> Kind:
         return checked
 
     schema = kind.schema | {"propertyNames": {"not": {"enum": sorted(own)}}}
-    return Kind(kind.span, schema, check)
+    return KeyKind(kind.span, schema, check)
 
 
 def _check_ratio(value: Any) -> Fraction:
@@ -236,13 +236,13 @@ TEXT = pattern("string", r"[^\x00]*[^\x00\s][^\x00]*", "is blank or contains a N
 _RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
 _RATIO_NUMBER = {"type": "number", "minimum": 0.001, "maximum": 1000}
 _RATIO_TEXT = {"type": "string", "pattern": f"^{_RATIO}$"}
-RATIO = Kind("0.001 … 1000", {"anyOf": [_RATIO_NUMBER, _RATIO_TEXT]}, _check_ratio)
-NAMES = Kind("list of strings", {"type": "array", "items": TEXT.schema}, _check_names)
+RATIO = KeyKind("0.001 … 1000", {"anyOf": [_RATIO_NUMBER, _RATIO_TEXT]}, _check_ratio)
+NAMES = KeyKind("list of strings", {"type": "array", "items": TEXT.schema}, _check_names)
 _SOURCES = table_of(
-    Kind("sources or numbers", {"anyOf": [TEXT.schema, {"type": "number"}]}, _check_source)
+    KeyKind("sources or numbers", {"anyOf": [TEXT.schema, {"type": "number"}]}, _check_source)
 )
 _SIGNAL_OR_MESSAGE = {"anyOf": [_SOURCES.schema["additionalProperties"], _SOURCES.schema]}
-BINDINGS = Kind(
+BINDINGS = KeyKind(
     _SOURCES.span, {"type": "object", "additionalProperties": _SIGNAL_OR_MESSAGE}, _check_bindings
 )
 

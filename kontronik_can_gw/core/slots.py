@@ -187,7 +187,7 @@ class PythonSlot:
         until = self._last_ns + settings.inhibit_ns
         if now >= until:
             self._deferred_until = NEVER
-            self._owner.let_go(self, now)
+            self._owner.mark_pending(self, now)
         elif self._deferred_until == NEVER and not settings.plan.paced:
             # A paced slot waits for the next event or its timer instead.
             self._deferred_until = until
@@ -195,7 +195,7 @@ class PythonSlot:
 
     def send(self, now: int) -> None:
         if self._started and self._settings is not None:
-            self._owner.let_go(self, now)
+            self._owner.mark_pending(self, now)
 
     def on_event(self, now: int) -> None:
         """Handle an event of ``triggers``."""
@@ -325,7 +325,7 @@ class Slots:
             if events & slot.triggers:
                 slot.on_event(now)
 
-    def let_go(self, slot: PythonSlot, now: int) -> None:
+    def mark_pending(self, slot: PythonSlot, now: int) -> None:
         """Mark a slot as pending."""
         self.pending.setdefault(slot.place, now)
 

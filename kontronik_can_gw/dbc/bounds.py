@@ -112,7 +112,7 @@ def _line(text: str, found: re.Match[str]) -> int:
 
 
 @dataclass
-class _Message:
+class _Multiplexing:
     """The multiplexing of a message, by names of signals."""
 
     name: str
@@ -168,13 +168,13 @@ def _numbers(text: str) -> _Numbers:
         yield "exponent", int(exponent), f"line {_line(text, found)}: "
     for found in _NODE_LIST.finditer(text):
         yield "number of nodes", len(found[1].split()), ""
-    messages: defaultdict[int, list[_Message]] = defaultdict(list)
-    message = _Message("")
+    messages: defaultdict[int, list[_Multiplexing]] = defaultdict(list)
+    message = _Multiplexing("")
     signals = 0
     count = 0
     for found in _MESSAGE_OR_SIGNAL.finditer(text):
         if found[1]:
-            message = _Message(found[2])
+            message = _Multiplexing(found[2])
             signals = 0
             count += 1
             messages[int(found[1])].append(message)
@@ -204,7 +204,7 @@ def _numbers(text: str) -> _Numbers:
         yield _PAGES, total, f"{message.name}: "
 
 
-def _ranges(text: str, messages: Mapping[int, list[_Message]]) -> _Numbers:
+def _ranges(text: str, messages: Mapping[int, list[_Multiplexing]]) -> _Numbers:
     """Yield the numbers in the ranges of SG_MUL_VAL_.
 
     As in cantools, any single character separates the two numbers of a range.
@@ -233,7 +233,7 @@ def _count_texts(table: str) -> int:
     return table.count('"') // 2
 
 
-def _value_tables(text: str, messages: Mapping[int, list[_Message]]) -> _Numbers:
+def _value_tables(text: str, messages: Mapping[int, list[_Multiplexing]]) -> _Numbers:
     """Yield the sizes of value tables. A table counts once for each signal that uses it."""
     tables: dict[str, tuple[int, int]] = {}
     """Length and number of texts of each table."""

@@ -278,7 +278,7 @@ class EscReport:
             if bit.severity is Severity.ERROR:
                 self._errors |= 1 << bit
         self._before = 0
-        """The word at the last call of ``follow``."""
+        """The word at the last call of ``update``."""
         self._logged = 0
         """The bits whose begin was logged, and whose end was not."""
         self._onsets = 0
@@ -347,7 +347,7 @@ class EscReport:
         has_bits = any(word >> bit & 1 for bit in self._bits)
         return wire.WARNING if has_bits or not self.esc.up else wire.OK
 
-    def follow(self, events: int, now: int) -> None:
+    def update(self, events: int, now: int) -> None:
         """Count errors that have begun. ``events`` are bits of Event, or 0 once a second.
 
         Errors that exist when the link returns are not counted, because they may be old.

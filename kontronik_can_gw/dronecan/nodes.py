@@ -205,7 +205,7 @@ class Dronecan(Output):
         """Number of answers in the present second."""
         self._second_due = NEVER
         self._news: list[LogLine] = []
-        self._follow_ids()
+        self._update_ids()
 
     # --- calls of the gateway, see Output
 
@@ -236,7 +236,7 @@ class Dronecan(Output):
         return min(self._second_due, self._allocation.due)
 
     def on_event(self, esc: int, events: int, now: int) -> None:
-        self._reports[esc].follow(events, now)
+        self._reports[esc].update(events, now)
 
     def collision(self, esc: int, present: bool, now: int) -> None:
         self._nodes[esc].is_duplicate = present
@@ -330,7 +330,7 @@ class Dronecan(Output):
         """Send the messages of each second."""
         self._answers = 0
         for report in self._reports:
-            report.follow(0, now)
+            report.update(0, now)
         for node in self._by_id.values():
             self._send_node_status(node, now)
             if self._table.log_messages:
@@ -372,7 +372,7 @@ class Dronecan(Output):
         node = self._first_waiting()
         unique_id = b"" if node is None else node.setup.unique_id
         self._allocation.ask(unique_id, now)
-        self._follow_ids()
+        self._update_ids()
 
     def _first_waiting(self) -> Node | None:
         """Return the first node without a node-ID."""
@@ -396,7 +396,7 @@ class Dronecan(Output):
         node.start(now)
         self._ask(now)
 
-    def _follow_ids(self) -> None:
+    def _update_ids(self) -> None:
         """Update the ids to receive after a change of node-IDs."""
         self._by_id = {node.node_id: node for node in self._nodes if node.node_id}
         requests = SERVICE | REQUEST

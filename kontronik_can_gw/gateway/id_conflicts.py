@@ -55,10 +55,10 @@ class IdConflicts:
     @property
     def receive_ids(self) -> frozenset[int]:
         """As ``Gateway.receive_ids``."""
-        self._follow()
+        self._update_ids()
         return self._receive_ids
 
-    def _follow(self) -> None:
+    def _update_ids(self) -> None:
         """Compute the ids again if an output has changed."""
         revision = sum([output.revision for output in self._outputs])
         if revision == self._revision:
@@ -79,7 +79,7 @@ class IdConflicts:
 
     def first_own_id(self) -> int | None:
         """Return the lowest own id that belongs to no node, or None."""
-        self._follow()
+        self._update_ids()
         without_node = []
         for key, (owner, _) in self._own.items():
             if owner.esc is None:
@@ -88,7 +88,7 @@ class IdConflicts:
 
     def own_blocks(self) -> tuple[int, ...]:
         """Return the own blocks of ids."""
-        self._follow()
+        self._update_ids()
         return self._own_blocks
 
     def can_opened(self, now: int) -> None:
@@ -97,7 +97,7 @@ class IdConflicts:
 
     def receive(self, key: int, now: int) -> bool:
         """Take a data frame of another device. Return True if it has an own id."""
-        self._follow()
+        self._update_ids()
         own = key if key in self._own else block_of(key, self._own_blocks)
         if own is None or now < self._echoes_until:
             return False

@@ -203,24 +203,24 @@ class NativeCore:
                 part = data[begin : begin + KCG.MAX_READ]
             event = receive(core, esc, part, len(part), now, since)
             while event >= KCG.AGAIN:
-                self._follow_all(event & ~KCG.AGAIN, now)
+                self._dispatch_all(event & ~KCG.AGAIN, now)
                 event = receive(core, esc, part, len(part), now, since)
-            self._follow_all(event, now)
+            self._dispatch_all(event, now)
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         _check(esc, now, len(self.escs))
         event = self.library.kcg_port(self.core, esc, is_open, now)
-        self._follow_all(event, now)
+        self._dispatch_all(event, now)
 
     def expire(self, now: int) -> None:
         _check(0, now)
         event = self.library.kcg_expire(self.core, now)
-        self._follow_all(event, now)
+        self._dispatch_all(event, now)
 
     def advance(self, now: int) -> None:
         _check(0, now)
         event = self.library.kcg_advance(self.core, now)
-        self._follow_all(event, now)
+        self._dispatch_all(event, now)
         self._slots.advance(now)
 
     def advance_in_python(self, now: int) -> None:
@@ -239,14 +239,14 @@ class NativeCore:
         """Return the turns of a loop with this core."""
         return Turns(self.library, self.core, len(self.escs))
 
-    def follow(self, event: int, now: int) -> None:
-        """Follow an event that a turn returned. Further events are returned one by one."""
-        self._follow(event >> 8, event & 0xFF, now)
+    def dispatch(self, event: int, now: int) -> None:
+        """Pass on an event that a turn returned. Further events are returned one by one."""
+        self._dispatch(event >> 8, event & 0xFF, now)
 
-    def follow_others(self, now: int) -> None:
-        """Follow all further events of a turn, if the loop makes the rest of it."""
+    def dispatch_others(self, now: int) -> None:
+        """Pass on all further events of a turn, if the loop makes the rest of it."""
         event = self.library.kcg_next_event(self.core)
-        self._follow_all(event, now)
+        self._dispatch_all(event, now)
 
     @property
     def is_pending(self) -> bool:
@@ -283,13 +283,13 @@ class NativeCore:
     def stop(self, now: int) -> None:
         self.library.kcg_stop(self.core, now)
 
-    def _follow_all(self, event: int, now: int) -> None:
-        """Follow the event that a call of the core returned, and all further ones."""
+    def _dispatch_all(self, event: int, now: int) -> None:
+        """Pass on the event that a call of the core returned, and all further ones."""
         while event >= 0:
-            self._follow(event >> 8, event & 0xFF, now)
+            self._dispatch(event >> 8, event & 0xFF, now)
             event = self.library.kcg_next_event(self.core)
 
-    def _follow(self, esc: int, events: int, now: int) -> None:
+    def _dispatch(self, esc: int, events: int, now: int) -> None:
         if events & Event.LINK:
             self.link_changes.append(esc)
         for wanted, follow in self._followers:

@@ -12,7 +12,7 @@
    events of each frame. */
 typedef char kcg_max_read_is_too_large_for_kcg_found
     [(KCG_MAX_READ + KCG_MAX_HELD) / KCG_SHORTEST_FRAME <= KCG_FOUND ? 1 : -1];
-/* Kinds of entries (twin: capture/format.py, Kind). */
+/* Kinds of entries (twin: capture/format.py, EntryKind). */
 enum {
     BYTES = 1,
     FRAME = 2,

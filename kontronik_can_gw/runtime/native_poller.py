@@ -104,7 +104,7 @@ class NativePoller(Poller):
         turns.begin()
         while turns.run():
             if not self._follow():
-                self._core.follow_others(times.now)
+                self._core.dispatch_others(times.now)
                 if turns.has_unread:
                     self._core.receive(*turns.read())
                 turns.leave()
@@ -147,7 +147,7 @@ class NativePoller(Poller):
         if is_due := event == OUTPUTS:
             gateway.advance(now, with_core=False)
         else:
-            core.follow(event, now)
+            core.dispatch(event, now)
         if core.link_changes or core.reports_live or gateway.revision != revision:
             return False
         request.outputs_due = outputs_due = gateway.next_deadline(with_core=False)

@@ -77,7 +77,7 @@ def capture(context: Context, seconds: int, noise: bool = False) -> Path:
     With ``noise``, 5 % of the frames are damaged.
     """
     from kontronik_can_gw.assembly.assemble import assemble
-    from kontronik_can_gw.capture.format import Kind, block, data_payload, json_payload
+    from kontronik_can_gw.capture.format import EntryKind, block, data_payload, json_payload
     from kontronik_can_gw.cli.recording import setup_of
     from kontronik_can_gw.config.parse import parse
 
@@ -92,8 +92,8 @@ def capture(context: Context, seconds: int, noise: bool = False) -> Path:
     header = setup.header() | {"created_ns": start, "monotonic_ns": start, "wall_ns": start << 30}
     frames = [b"KOD" + frame for frame in flight().split(b"KOD")[1:]]
     first = [
-        (start, Kind.PORT_OPENED, 0, b"", 0, None),
-        (start, Kind.START, 0, b"", 1, None),
+        (start, EntryKind.PORT_OPENED, 0, b"", 0, None),
+        (start, EntryKind.START, 0, b"", 1, None),
     ]
     blocks = [(b"H", json_payload(header)), (b"D", data_payload(first))]
     for begin in range(0, 100 * seconds, 50):
@@ -105,8 +105,8 @@ def capture(context: Context, seconds: int, noise: bool = False) -> Path:
                 at = chance.randrange(len(wire))
                 wrong = bytes([wire[at] ^ 0x55])
                 wire = wire[:at] + wrong + wire[at + 1 :] + chance.randbytes(3)
-            entries.append((now, Kind.BYTES, 0, wire, 0, now - 4_000_000))
-            entries.append((now, Kind.ADVANCE, 0, b"", 0, None))
+            entries.append((now, EntryKind.BYTES, 0, wire, 0, now - 4_000_000))
+            entries.append((now, EntryKind.ADVANCE, 0, b"", 0, None))
         blocks.append((b"D", data_payload(entries)))
     blocks.append((b"E", b""))
     with file.open("wb") as out:

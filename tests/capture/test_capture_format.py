@@ -28,7 +28,7 @@ from kontronik_can_gw.capture.format import (
     Block,
     Damage,
     Entry,
-    Kind,
+    EntryKind,
     Scanner,
     block,
     data_payload,
@@ -67,7 +67,7 @@ def scanned(data: bytes, size: int | None = None) -> list[Block | Damage]:
 @given(st.lists(entries, max_size=20))
 def test_entries_are_read_as_they_were_written(listed: list[Entry]) -> None:
     expected = [
-        entry if entry.kind in (Kind.BYTES, Kind.FRAME) else entry._replace(came_ns=None)
+        entry if entry.kind in (EntryKind.BYTES, EntryKind.FRAME) else entry._replace(came_ns=None)
         for entry in listed
     ]
     assert list(read_entries(data_payload(listed))) == expected
@@ -371,9 +371,9 @@ def test_wrong_entries_cause_only_our_own_errors(
                     entry._replace(kind=rng.randrange(256), flags=rng.randrange(256)),
                     entry._replace(esc=rng.randrange(65536)),
                     entry._replace(data=rng.randbytes(rng.randrange(40))),
-                    Entry(entry.time_ns, Kind.START, flags=1),
-                    Entry(entry.time_ns, Kind.STATE, 0, b'{"escs": 7}'),
-                    Entry(entry.time_ns, Kind.SAVED),
+                    Entry(entry.time_ns, EntryKind.START, flags=1),
+                    Entry(entry.time_ns, EntryKind.STATE, 0, b'{"escs": 7}'),
+                    Entry(entry.time_ns, EntryKind.SAVED),
                 ]
             )
         head = block(b"H", 0, json_payload(header))

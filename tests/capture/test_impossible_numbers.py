@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from capture_bench import START, Bench, capture, made
 
-from kontronik_can_gw.capture.format import COUNTERS, Entry, Kind, numbers_data
+from kontronik_can_gw.capture.format import COUNTERS, Entry, EntryKind, numbers_data
 from kontronik_can_gw.capture.limits import check_state
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.desk.recordings.inputs import open_input
@@ -66,7 +66,7 @@ def test_impossible_counters_are_rejected_and_change_nothing(started_ns: int) ->
     late_start = numbers_data(*counters, started_ns)
     high_count = numbers_data(*counters[1:], MAX_COUNT, START)
     for bad in (late_start, high_count):
-        entries = [Entry(now, Kind.COUNTERS, 0, data) for data in (good, bad)]
+        entries = [Entry(now, EntryKind.COUNTERS, 0, data) for data in (good, bad)]
         list(replay.follow(entries))
     assert replay.rejected == 2
     assert gateway.status.started_ns == START - 77
@@ -79,8 +79,8 @@ def test_an_impossible_time_is_rejected(time_ns: int) -> None:
     replay = Replay(bench.setup.gateway(bench.layout, START))
     list(replay.follow(bench.entries))
     impossible = [
-        Entry(time_ns, Kind.ADVANCE),
-        Entry(START, Kind.BYTES, data=b"K", came_ns=time_ns),
+        Entry(time_ns, EntryKind.ADVANCE),
+        Entry(START, EntryKind.BYTES, data=b"K", came_ns=time_ns),
     ]
     list(replay.follow(impossible))
     assert replay.rejected == 2
@@ -107,7 +107,11 @@ def test_rows_of_a_capture_with_impossible_counters_are_equal_in_c(
         9,
         (1 << 63) - 1,
     )
-    entries = [*bench.entries[:half], Entry(now, Kind.COUNTERS, 0, data), *bench.entries[half:]]
+    entries = [
+        *bench.entries[:half],
+        Entry(now, EntryKind.COUNTERS, 0, data),
+        *bench.entries[half:],
+    ]
     path = capture(tmp_path / "far.kcap", bench.setup, entries)
     found = []
     for library in (native_library, None):

@@ -12,7 +12,7 @@ from simulated_bus import write_log
 
 from kontronik_can_gw.capture.format import (
     Entry,
-    Kind,
+    EntryKind,
     block,
     data_payload,
     json_payload,
@@ -122,13 +122,13 @@ def test_a_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: P
 
 
 def byte_entry(time_ns: int) -> Entry:
-    return Entry(time_ns, Kind.BYTES, 0, b"x", 0, time_ns)
+    return Entry(time_ns, EntryKind.BYTES, 0, b"x", 0, time_ns)
 
 
 def clock_entry(time_ns: int, wall_ns: int) -> Entry:
     return Entry(
         time_ns,
-        Kind.CLOCK,
+        EntryKind.CLOCK,
         0,
         numbers_data(wall_ns),
         0,
@@ -158,7 +158,7 @@ def test_a_changed_wall_clock_applies_to_later_entries(tmp_path: Path) -> None:
     )
     with open_input(tmp_path) as found:
         assert isinstance(found, CaptureInput)
-        times = [each.time_ns for each in found.entries() if each.kind == Kind.BYTES]
+        times = [each.time_ns for each in found.entries() if each.kind == EntryKind.BYTES]
         walls = [found.wall_ns(time_ns) for time_ns in times]
         assert found.damage == []
     assert [time_ns - START for time_ns in times] == [0, SECOND, 2 * SECOND, 5 * SECOND]

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from capture_bench import START, Bench, made
 
-from kontronik_can_gw.capture.format import Entry, Kind, read_numbers
+from kontronik_can_gw.capture.format import Entry, EntryKind, read_numbers
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError
@@ -55,8 +55,8 @@ class Bed:
         """
         self.it.close()
         found = recorded(self.folder)
-        with_bytes = [entry for entry in found if entry.kind == Kind.BYTES]
-        losses = [sum(read_numbers(entry.data)) for entry in found if entry.kind == Kind.LOST]
+        with_bytes = [entry for entry in found if entry.kind == EntryKind.BYTES]
+        losses = [sum(read_numbers(entry.data)) for entry in found if entry.kind == EntryKind.LOST]
         begins = [report.begins for report in self.it.reports(0)]
         return with_bytes, sum(losses), begins
 
@@ -73,7 +73,7 @@ def entries(count: int, since: int = 0) -> list[Entry]:
         data = bytes((number & 255,)) * (number % 50)
         entry = Entry(
             time_ns=1000 + number,
-            kind=Kind.BYTES,
+            kind=EntryKind.BYTES,
             esc=number % 3,
             data=data,
             flags=number % 2,
@@ -87,7 +87,11 @@ def recorded(path: Path, damage: str = "") -> list[Entry]:
     """Return the entries of a folder or file. Its damage must be reported with ``damage``."""
     with open_input(path) as found:
         assert isinstance(found, CaptureInput)
-        every = [entry for entry in found.entries() if entry.kind not in (Kind.CLOCK, Kind.STATE)]
+        every = [
+            entry
+            for entry in found.entries()
+            if entry.kind not in (EntryKind.CLOCK, EntryKind.STATE)
+        ]
         assert damage in "\n".join(found.damage)
         return every
 
@@ -285,7 +289,7 @@ def test_a_changed_wall_clock_is_recorded(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(time, "time_ns", lambda: bed.now + shift)
     for data, forward in ((b"a", 0), (b"x", 3600 * SECOND), (b"b", 0)):
         shift += forward
-        bed.step(Entry(bed.now, Kind.BYTES, 0, data))
+        bed.step(Entry(bed.now, EntryKind.BYTES, 0, data))
         bed.now += 11 * SECOND
     bed.it.close()
     with open_input(tmp_path) as found:

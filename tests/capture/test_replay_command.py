@@ -11,7 +11,7 @@ from pathlib import Path
 from capture_bench import START, Bench, capture, made
 from command_line import refused, written
 
-from kontronik_can_gw.capture.format import Kind
+from kontronik_can_gw.capture.format import EntryKind
 from kontronik_can_gw.times import SECOND
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
@@ -62,5 +62,5 @@ def test_a_terminal_receives_the_bytes_of_its_esc(tmp_path: Path) -> None:
                 found += data
         os.close(fd)
         assert player.wait(600) == 0
-    with_bytes = [entry for entry in bench.entries if entry.kind == Kind.BYTES]
+    with_bytes = [entry for entry in bench.entries if entry.kind == EntryKind.BYTES]
     assert found == b"".join(entry.data for entry in with_bytes if entry.esc == 1)

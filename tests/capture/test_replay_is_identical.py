@@ -10,7 +10,7 @@ from kontronik_can_gw.capture.format import (
     VERSION,
     Block,
     Entry,
-    Kind,
+    EntryKind,
     Scanner,
     block,
     data_payload,
@@ -62,7 +62,7 @@ def test_frames_and_times_of_a_replay_equal_the_live_ones(
     frames = replayed(bench)
     assert len(bench.sent) > 500
     assert [frame for frame in frames if not frame.received] == bench.sent
-    received = sum(entry.kind == Kind.FRAME for entry in bench.entries)
+    received = sum(entry.kind == EntryKind.FRAME for entry in bench.entries)
     assert sum(frame.received for frame in frames) == received
     assert received > 3
 

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get
 
 from kontronik_can_gw.dbc.names import Binder
-from kontronik_can_gw.esc.kontronik.codec import WireLayout
-from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway

@@ -214,8 +214,9 @@ def test_an_unbound_signal_has_its_start_value_as_cantools_reads_it() -> None:
     for plan in layout.messages:
         shown |= {signal.name: held(signal) for signal in plan.signals if signal.unbound}
     assert shown == {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}
-    once = "my_car.dbc: sent only once, at the start, without a cycle time or a changing value"
-    assert [line for line in layout.warnings if "sent only once" in line] == [f"{once}: Motor_21"]
+    (once,) = [line for line in layout.warnings if "sent only once" in line]
+    assert once.startswith("my_car.dbc: sent only once, at the start, ")
+    assert once.endswith(": Motor_21")
 
 
 def test_a_start_value_may_be_any_number_that_fits_into_the_signal() -> None:

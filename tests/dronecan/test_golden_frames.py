@@ -17,8 +17,7 @@ from kontronik_can_gw.core.slots import SlotSettings
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.esc_report import fill, plans_of
 from kontronik_can_gw.dronecan.wire import Assembler, DataType, message_id, response_id
-from kontronik_can_gw.esc.kontronik.codec import WireLayout
-from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingState
 from kontronik_can_gw.esc.protocols import PROTOCOLS

@@ -23,7 +23,7 @@ from capture_bench import START, Bench, capture_file, made
 from esc.reference import form_row
 from numpy.typing import NDArray
 
-from kontronik_can_gw.capture.format import Entry, Kind, numbers_data
+from kontronik_can_gw.capture.format import Entry, EntryKind, numbers_data
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.simulator import (
     Dropout,
@@ -138,7 +138,7 @@ class Truth:
         lost, again = self.unplugged
         trouble = START + self.length // 4
         wall = self.clock_set_ns - START + WALL + CLOCK_STEP
-        clock = Entry(self.clock_set_ns, Kind.CLOCK, 0, numbers_data(wall))
+        clock = Entry(self.clock_set_ns, EntryKind.CLOCK, 0, numbers_data(wall))
         happenings: list[tuple[int, Callable[[int], object]]] = [
             (trouble, lambda at: gateway.set_can_state(CanState.ERROR_WARNING, at)),
             (trouble + 2 * SECOND, lambda at: gateway.set_can_state(CanState.ERROR_ACTIVE, at)),

@@ -36,8 +36,7 @@ from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.core.slots import Slot, SlotPlan, SlotSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.kontronik.codec import WireLayout
-from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.esc.values import VALUES, Group, Kind
 from kontronik_can_gw.frames import CanFrame

@@ -12,7 +12,7 @@ from typing import Any
 import equality
 from capture_bench import START, Bench, made
 
-from kontronik_can_gw.capture.format import Entry, Kind, block, data_payload, json_payload
+from kontronik_can_gw.capture.format import Entry, EntryKind, block, data_payload, json_payload
 from kontronik_can_gw.desk.recordings import bytes_input
 from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
 from kontronik_can_gw.desk.recordings.fields import Choice
@@ -51,18 +51,20 @@ def odd(chance: random.Random, last: Entry) -> Entry:
     noise = equality.stream(chance)
     return chance.choice(
         (
-            Entry(now, Kind.CLOCK, 0, (START + chance.randrange(1 << 60)).to_bytes(8, "little")),
-            Entry(now, Kind.CLOCK, 0, b"short"),
-            Entry(now, Kind.NOT_SENT),
-            Entry(now, Kind.COUNTERS, 0, number * 8),
-            Entry(now, Kind.COUNTERS, 0, number * 3),
-            Entry(now, Kind.LOST, 0, number),
-            Entry(now, Kind.FRAME, 0, b"1"),
-            Entry(now, Kind.HELD_UP, 0, b"", 1),
-            Entry(now - chance.randrange(SECOND), Kind.ADVANCE),
-            Entry(now, Kind.BYTES, 0, noise, 0, now - chance.randrange(SECOND)),
-            Entry(now, Kind.BYTES, 0, bytes(17_000) + noise, 0, now),
-            Entry(now, Kind.BYTES, 9, noise, 0, now),
+            Entry(
+                now, EntryKind.CLOCK, 0, (START + chance.randrange(1 << 60)).to_bytes(8, "little")
+            ),
+            Entry(now, EntryKind.CLOCK, 0, b"short"),
+            Entry(now, EntryKind.NOT_SENT),
+            Entry(now, EntryKind.COUNTERS, 0, number * 8),
+            Entry(now, EntryKind.COUNTERS, 0, number * 3),
+            Entry(now, EntryKind.LOST, 0, number),
+            Entry(now, EntryKind.FRAME, 0, b"1"),
+            Entry(now, EntryKind.HELD_UP, 0, b"", 1),
+            Entry(now - chance.randrange(SECOND), EntryKind.ADVANCE),
+            Entry(now, EntryKind.BYTES, 0, noise, 0, now - chance.randrange(SECOND)),
+            Entry(now, EntryKind.BYTES, 0, bytes(17_000) + noise, 0, now),
+            Entry(now, EntryKind.BYTES, 9, noise, 0, now),
             Entry(now, 77),
         )
     )

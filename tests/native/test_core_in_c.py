@@ -14,8 +14,7 @@ from dbc_bench import compiled
 from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.core.python_core import PythonCore
-from kontronik_can_gw.esc.kontronik.codec import WireLayout
-from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.binding import WrongObject, load

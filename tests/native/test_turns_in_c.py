@@ -25,7 +25,7 @@ from kontronik_can_gw.canopen.cob_ids import EMERGENCY, HEARTBEAT
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.capture.format import Entry, Kind
+from kontronik_can_gw.capture.format import Entry, EntryKind
 from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.output_keys import DronecanConfig
@@ -33,8 +33,7 @@ from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.core.output_setup import OutputSetup, ReadyOutput
 from kontronik_can_gw.dronecan.node_setup import Given
 from kontronik_can_gw.dronecan.setup import DronecanSetup
-from kontronik_can_gw.esc.kontronik.codec import WireLayout
-from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
@@ -151,7 +150,7 @@ class Recorded(InC):
         flags: int,
         came: int | None = None,
     ) -> None:
-        self.entries.append(Entry(now, Kind(kind), esc, data, flags, came))
+        self.entries.append(Entry(now, EntryKind(kind), esc, data, flags, came))
 
     def sent(self) -> list[tuple[int, bytes]]:
         """Run to the end. Return the frames that were sent."""

@@ -13,7 +13,7 @@ from command_line import run
 from log_files import SUFFIX, Item, message_of, opened, write_log
 from recordings import WALL_NS, candump_log
 
-from kontronik_can_gw.capture.format import Entry, Kind, numbers_data
+from kontronik_can_gw.capture.format import Entry, EntryKind, numbers_data
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.log_clock import LogClock
 from kontronik_can_gw.desk.recordings.recording import ClockStep, LogFrame
@@ -206,7 +206,7 @@ def test_a_clock_set_during_a_capture_is_reported(tmp_path: Path, by_s: int, wor
             middle = len(entries) // 2
             now = entries[middle].time_ns
             wall_ns = WALL_NS + now - entries[0].time_ns + by_s * 1000 * MS
-            entries.insert(middle + 1, Entry(now, Kind.CLOCK, 0, numbers_data(wall_ns)))
+            entries.insert(middle + 1, Entry(now, EntryKind.CLOCK, 0, numbers_data(wall_ns)))
         paths.append(tmp_path / f"{name}.kcap")
         paths[-1].write_bytes(capture_file(bench.setup, entries, wall_ns=WALL_NS))
     note = f"set.kcap: the clock was set {words} after "

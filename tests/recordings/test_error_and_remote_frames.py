@@ -10,7 +10,7 @@ from command_line import run
 from log_files import READERS, SUFFIX, opened
 from recordings import candump_log
 
-from kontronik_can_gw.capture.format import Entry, Kind, frame_data
+from kontronik_can_gw.capture.format import Entry, EntryKind, frame_data
 from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
 from kontronik_can_gw.desk.recordings.recording import ERROR, LogFrame
 from kontronik_can_gw.frames import CanFrame
@@ -191,7 +191,7 @@ def test_remote_frames_of_a_capture_are_remote_frames_in_a_log(tmp_path: Path) -
     bench = Bench(*made()).live(3, 0.5)
     entries = list(bench.entries)
     now = entries[40].time_ns
-    entries.insert(41, Entry(now, Kind.FRAME, 0, frame_data(ASKS), 0, now))
+    entries.insert(41, Entry(now, EntryKind.FRAME, 0, frame_data(ASKS), 0, now))
     path = tmp_path / "a.kcap"
     path.write_bytes(capture_file(bench.setup, entries))
     assert run("convert", path, tmp_path / "a.log").code == 0

@@ -14,7 +14,7 @@ from esc.sheet import LIVE_STRUCT
 from esc.streams import random_stream
 from recordings import convert, dump_bytes
 
-from kontronik_can_gw.capture.format import Kind
+from kontronik_can_gw.capture.format import EntryKind
 from kontronik_can_gw.desk.recordings import bytes_input
 from kontronik_can_gw.desk.recordings.bytes_input import BytesInput
 
@@ -71,7 +71,7 @@ def test_rows_are_exactly_the_frames_found_by_brute_force(
     at = 0
     ends = {}
     for entry in dump.entries():
-        if entry.kind == Kind.BYTES:
+        if entry.kind == EntryKind.BYTES:
             assert entry.data
             at += len(entry.data)
             ends[at] = entry.time_ns

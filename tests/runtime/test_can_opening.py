@@ -19,8 +19,7 @@ from wire_world import Bus, World, layout_of
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik.codec import WireLayout
-from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway

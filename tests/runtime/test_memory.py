@@ -16,8 +16,7 @@ from wire_world import World, loop_in, run
 
 from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
 from kontronik_can_gw.config.keys import RecordConfig
-from kontronik_can_gw.esc.kontronik.codec import WireLayout
-from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.runtime.files.recorder import Recorder
 from kontronik_can_gw.runtime.housekeeping import COLLECT_NS

@@ -16,8 +16,7 @@ from packer_oracle import Msg, Sig, dbc_text
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.esc.kontronik.codec import WireLayout
-from kontronik_can_gw.esc.kontronik.codec import encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import EscSettings

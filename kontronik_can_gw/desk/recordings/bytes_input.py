@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
-from kontronik_can_gw.capture.format import Entry, Kind
+from kontronik_can_gw.capture.format import Entry, EntryKind
 from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
@@ -84,11 +84,11 @@ class BytesInput(PlayedInput):
         decoder = PROTOCOLS[0].make()
         for now, reading in self._read_frames(decoder, hold(self.esc_bytes(0))):
             size = reading.offset + reading.form.length - given
-            yield Entry(now, Kind.BYTES, data=bytes(held[:size]))
+            yield Entry(now, EntryKind.BYTES, data=bytes(held[:size]))
             del held[:size]
             given += size
         if held:
-            yield Entry(now, Kind.BYTES, data=bytes(held))
+            yield Entry(now, EntryKind.BYTES, data=bytes(held))
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:  # noqa: ARG002  there is only one ESC
         self._head = b""

@@ -15,7 +15,7 @@ from kontronik_can_gw.capture.format import Block as DataBlock
 from kontronik_can_gw.capture.format import (
     Damage,
     Entry,
-    Kind,
+    EntryKind,
     Scanner,
     entry_at,
     read_entries,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 CHUNK = 1 << 18
 """Number of bytes that are read at once."""
-_PLAYED = frozenset({Kind.BYTES, Kind.ADVANCE, Kind.COUNTERS})
+_PLAYED = frozenset({EntryKind.BYTES, EntryKind.ADVANCE, EntryKind.COUNTERS})
 """Kinds of entries that a player plays.
 
 After one of these, it is certain that the frames of the previous turn were sent.
@@ -132,7 +132,7 @@ class CaptureInput(PlayedInput):
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         for entry in self.entries():
-            if entry.kind == Kind.BYTES and entry.esc == esc:
+            if entry.kind == EntryKind.BYTES and entry.esc == esc:
                 yield entry.data
 
     def _play(
@@ -173,15 +173,15 @@ class CaptureInput(PlayedInput):
             if not player.begin(payload):
                 in_python = True
                 yield []
-                replay.go_on(list(timed(player.take_frames(final=True))))
+                replay.add_frames(list(timed(player.take_frames(final=True))))
                 for entry in self._entries_of(payload):
                     yield replay.play(entry)
                 continue
             while (kind := player.next_kind) is not None:
                 # waiting frames may still be dropped by an entry that the player does not play
                 if in_python or (replay.frames_wait and kind not in _PLAYED):
-                    if kind != Kind.NOT_SENT:
-                        in_python = kind != Kind.ADVANCE
+                    if kind != EntryKind.NOT_SENT:
+                        in_python = kind != EntryKind.ADVANCE
                     entry = entry_at(payload, *player.skip())
                     checked = self._checked(entry)
                     if checked is not None:
@@ -191,7 +191,7 @@ class CaptureInput(PlayedInput):
                     in_python, self._last_ns = player.play(self._last_ns)
                     yield []
                     if in_python:
-                        replay.go_on(list(timed(player.take_frames(final=True))))
+                        replay.add_frames(list(timed(player.take_frames(final=True))))
 
     def _entries_of(self, payload: bytes) -> Iterator[Entry]:
         try:
@@ -208,7 +208,7 @@ class CaptureInput(PlayedInput):
         A clock entry also sets the offset of the wall clock.
         """
         time_ns = entry.time_ns
-        is_clock = entry.kind == Kind.CLOCK
+        is_clock = entry.kind == EntryKind.CLOCK
         wall_ns = 0
         if is_clock and len(entry.data) == 8:
             (wall_ns,) = read_numbers(entry.data)

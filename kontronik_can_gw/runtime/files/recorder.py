@@ -24,7 +24,7 @@ from typing import Any
 
 from kontronik_can_gw.capture.format import (
     SUFFIX,
-    Kind,
+    EntryKind,
     block,
     data_payload,
     json_payload,
@@ -160,7 +160,7 @@ class Recorder:
         self._devices = devices_of(gateway)
         if now - self._state_ns >= _STATE_NS:
             self._state_ns = now
-            self.put(now, Kind.STATE, 0, json_payload(state_of(gateway)), 0)
+            self.put(now, EntryKind.STATE, 0, json_payload(state_of(gateway)), 0)
 
     def reports(self, now: int) -> list[Report]:
         """Return the begins and ends of faults since the last call."""
@@ -253,13 +253,13 @@ class Recorder:
         lost = self._overflowed + self._unwritten - self._recorded_losses
         if lost > 0:
             self._recorded_losses += lost
-            items.append((last, Kind.LOST, 0, numbers_data(lost), 0, None))
+            items.append((last, EntryKind.LOST, 0, numbers_data(lost), 0, None))
         if now - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = now
             offset = time.time_ns() - self._clock()
             if abs(offset - self._offset) > _STEP_NS:
                 self._offset = offset
-                items.append((last, Kind.CLOCK, 0, numbers_data(last + offset), 0, None))
+                items.append((last, EntryKind.CLOCK, 0, numbers_data(last + offset), 0, None))
 
     def _fail(self, error: Exception, now: int) -> None:
         file = self._file
