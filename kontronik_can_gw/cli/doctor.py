@@ -86,7 +86,7 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
         code = error.exit_code
         command = "" if config is None else f"kontronik-can-gw check -c {path}"
         for problem in error.problems:
-            about.say("config", "mistake", problem=problem, command=command)
+            about.add("config", "mistake", problem=problem, command=command)
     if config is not None:
         _folders(machine, about, config, unit)
         files = [machine.path(str(file)) for file in possible_files(path)]
@@ -98,9 +98,9 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
         found += check_can(machine, config.can)
     check_service(machine, rest, unit, full)
     if _has_low_voltage(machine):
-        rest.say("machine.power", "low")
+        rest.add("machine.power", "low")
     versions = {"python": platform.python_version(), "kernel": platform.release()}
-    rest.say("machine.versions", "ok", version=__version__, **versions)
+    rest.add("machine.versions", "ok", version=__version__, **versions)
     found += rest.found
     if code == 0 and count(found, "error") > 0:
         code = 1
@@ -116,12 +116,12 @@ def _has_low_voltage(machine: Machine) -> bool:
 
 def _outputs(findings: Findings, loaded: Loaded) -> None:
     """Report the core that would run, and warnings."""
-    findings.say("config", "ok", file=loaded.config.file)
+    findings.add("config", "ok", file=loaded.config.file)
     core, reason = make_core(loaded.escs, loaded.layout, 0, silent_on_loss=False)
     case = "python" if reason else "ok"
-    findings.say("config.core", case, core=in_words(core.language, reason))
+    findings.add("config.core", case, core=in_words(core.language, reason))
     for warning in (*loaded.layout.warnings, *loaded.warnings):
-        findings.say("config.warning", "any", warning=warning)
+        findings.add("config.warning", "any", warning=warning)
 
 
 def _folders(machine: Machine, findings: Findings, config: Config, unit: Unit | None) -> None:

@@ -117,6 +117,6 @@ def _analysed(recording: Input, args: argparse.Namespace) -> Flight:
         )
     blocks = filter(len, recording.blocks(chosen))
     for block in watched(blocks, f"{recording.name}: rows", args.output == "-"):
-        if not flight.take(block):
+        if not flight.evaluate(block):
             break
     return flight.finish()

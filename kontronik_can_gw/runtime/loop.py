@@ -117,7 +117,7 @@ class Loop:
             self.can.open(now, self._wait)
             if self._recorder is not None:
                 self._recorder.start(self._wait)
-                self.conditions.say(logging.INFO, f"recording to {self._recorder.words}")
+                self.conditions.log(logging.INFO, f"recording to {self._recorder.words}")
         except UserError:
             self.close()
             raise
@@ -233,7 +233,7 @@ class Loop:
         self._housekeeping.follow_recorder(now)  # records the devices
         self.gateway.stop(now)
         self.can.transmit(now)
-        self.conditions.say(logging.INFO, f"{self._reason} {totals(self.gateway, now)}")
+        self.conditions.log(logging.INFO, f"{self._reason} {totals(self.gateway, now)}")
         self.close()
 
     def close(self) -> None:

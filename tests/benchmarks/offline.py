@@ -173,7 +173,7 @@ def report(source: Path) -> float:
         chosen = needed_columns(recording.fields)
         flight = Flight(recording.bus.escs, [recording.fields[index] for index in chosen])
         for block in recording.blocks(chosen):
-            flight.take(block)
+            flight.evaluate(block)
         render(flight.finish(), source=source.name, damage=recording.damage)
     return time.process_time() - begun
 

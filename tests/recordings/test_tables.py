@@ -27,8 +27,8 @@ from kontronik_can_gw.desk.recordings import tables
 from kontronik_can_gw.desk.recordings.convert import _table_writer
 from kontronik_can_gw.desk.recordings.fields import (
     Choice,
+    ColumnType,
     Field,
-    Kind,
     Table,
     distinct,
     fields_of_values,
@@ -127,17 +127,19 @@ def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_p
 def test_names_that_are_there_twice_get_their_message_in_front() -> None:
     names = ("A X ", "B X ", "B Y ", "B Time ", "C Z Za", "C Z Zb")
     parts = [text.split(" ") for text in names]
-    fields = [Field(name, "V", Kind.FLOAT, message, signal=own) for message, name, own in parts]
+    fields = [
+        Field(name, "V", ColumnType.FLOAT, message, signal=own) for message, name, own in parts
+    ]
     found = [field.name for field in distinct(fields)]
     assert found == ["A.X", "B.X", "Y", "B.Time", "C.Za", "C.Zb"]
 
 
 TEXTS = ((0, "Plain"), (1, 'odd, "quoted"'), (7, "{braces}"), (300, "µ"))
 FIELDS = (
-    Field("Flag", "", Kind.FLAG, "M"),
-    Field("Whole", "us", Kind.WHOLE, "M"),
-    Field("Float", "deg C", Kind.FLOAT, "M"),
-    Field("Text", "", Kind.TEXT, "M", TEXTS),
+    Field("Flag", "", ColumnType.FLAG, "M"),
+    Field("Whole", "us", ColumnType.WHOLE, "M"),
+    Field("Float", "deg C", ColumnType.FLOAT, "M"),
+    Field("Text", "", ColumnType.TEXT, "M", TEXTS),
 )
 ROW = st.tuples(
     st.integers(0, 10**13),

@@ -50,7 +50,7 @@ def flight_of(bus: BusLayout, rows: Iterable[Row], points: int = 2000) -> Flight
     while some := list(islice(every, 100)):
         times, values = zip(*some, strict=True)
         columns = list(zip(*values, strict=True))
-        made.take(Block(times, columns, None))
+        made.evaluate(Block(times, columns, None))
     return made.finish()
 
 

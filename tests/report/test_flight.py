@@ -14,9 +14,9 @@ import pytest
 from report_flights import Row, column, flight_of, rows_of, simulated
 from simulated_bus import layout_of
 
-from kontronik_can_gw.desk.recordings.fields import Field, Kind
+from kontronik_can_gw.desk.recordings.fields import ColumnType, Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.desk.report.esc import EscFlight, Event, Events
+from kontronik_can_gw.desk.report.esc import EscFlight, FlightEvent, FlightEvents
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import render
 from kontronik_can_gw.desk.report.quantities import MINIMA
@@ -147,7 +147,7 @@ def test_the_numbers_equal_those_computed_by_pandas(
 def test_errors_and_a_swapped_device_are_events_at_their_times(flight: Flight) -> None:
     errors = [event for event in flight.events if event.kind == "error"]
 
-    def of(text: str) -> list[Event]:
+    def of(text: str) -> list[FlightEvent]:
         return [error for error in errors if error.text == text and error.esc == 0]
 
     for text, severity, *times in (
@@ -273,12 +273,12 @@ def test_distant_rows_are_not_joined_even_without_a_row_for_the_loss(points: int
 
 def test_words_of_errors_and_states_become_events() -> None:
     """The ESC has a word of errors instead of a flag for each bit, as in captures."""
-    events = Events()
+    events = FlightEvents()
     kinds = {
-        "operating_errors": Kind.WHOLE,
-        "operating_state": Kind.TEXT,
-        "battery_voltage": Kind.FLOAT,
-        "bec_voltage": Kind.FLOAT,
+        "operating_errors": ColumnType.WHOLE,
+        "operating_state": ColumnType.TEXT,
+        "battery_voltage": ColumnType.FLOAT,
+        "bec_voltage": ColumnType.FLOAT,
     }
     fields = []
     for source, kind in kinds.items():
@@ -294,7 +294,7 @@ def test_words_of_errors_and_states_become_events() -> None:
         [24.0, 24.0, 24.0, 24.0, None],
         [7.5, inf, 7.5, None, 7.5],
     ]
-    *_, bec = esc.take([0, 10, 20, 30, 40], rows)
+    *_, bec = esc.evaluate([0, 10, 20, 30, 40], rows)
     assert list(bec) == [7.5, None, 7.5, None, 7.5], "a float signal may be infinite"
     assert [(e.begin_ns, e.end_ns, e.text, e.note) for e in events.in_order()] == [
         (0, 20, "Forward", ""),

@@ -42,7 +42,7 @@ class Findings:
         self.found: list[Finding] = []
         self.values = values
 
-    def say(self, check: str, case: str, **values: object) -> None:
+    def add(self, check: str, case: str, **values: object) -> None:
         """Add the finding for a case of a check."""
         severity, *texts = _WORDINGS[check][case]
         all_values = self.values | values

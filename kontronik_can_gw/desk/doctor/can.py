@@ -41,7 +41,7 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
     net = "/sys/class/net"
     folder = f"{net}/{can.channel}"
     if can.interface != "socketcan":
-        findings.say("can.driver", "unseen", interface=can.interface)
+        findings.add("can.driver", "unseen", interface=can.interface)
         return findings.found
     if machine.text(f"{folder}/type") != _CAN_TYPE:
         there = []
@@ -53,21 +53,21 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
             case = "others" if there else "none"
             if kind_by_name(can.channel) in VIRTUAL:
                 case = "no_virtual"
-        findings.say("can.exists", case, there=", ".join(there) or "none")
+        findings.add("can.exists", case, there=", ".join(there) or "none")
         return findings.found
     link = _link(machine, can.channel)
     kind = link.get("info_kind") or kind_by_name(can.channel)
     virtual = kind in VIRTUAL
     findings.values["up"] = set_up(can, kind)
     findings.values["fd"] = enable_fd(can, kind)
-    findings.say("can.exists", "virtual" if virtual else "ok", kind=kind)
+    findings.add("can.exists", "virtual" if virtual else "ok", kind=kind)
     flags = int(machine.text(f"{folder}/flags") or "0", 0)
     is_up = bool(flags & 1)
-    findings.say("can.up", "ok" if is_up else "down")
+    findings.add("can.up", "ok" if is_up else "down")
     if can.fd and int(machine.text(f"{folder}/mtu") or "0") < _FD_MTU:
-        findings.say("can.fd", "off")
+        findings.add("can.fd", "off")
     if not link:
-        findings.say("can.details", "no_ip")
+        findings.add("can.details", "no_ip")
     elif not virtual:
         # an slcan interface has no device, and cannot leave bus-off by itself
         has_restart = kind != "can" or machine.exists(f"{folder}/device")
@@ -105,12 +105,12 @@ def _controller(
             case = "other" if real else "none"
             if real == wanted:
                 case = "ok"
-            findings.say("can.bitrate", case, key=key, wanted=wanted, real=real)
+            findings.add("can.bitrate", case, key=key, wanted=wanted, real=real)
         ms = data.get("restart_ms", 0)
         case = "slcan"
         if has_restart:
             case = "ok" if ms else "never"
-        findings.say("can.restart", case, ms=ms)
+        findings.add("can.restart", case, ms=ms)
     state = data.get("state", "STOPPED")
     counters = data.get("berr_counter", {})
     counts = ""
@@ -120,6 +120,6 @@ def _controller(
     if state == "BUS-OFF":
         case = "off" if has_restart else "off_slcan"
     if state != "STOPPED":  # a stopped interface is down, which was reported above
-        findings.say("can.state", case, counts=counts, state=state.lower())
+        findings.add("can.state", case, counts=counts, state=state.lower())
     for mode in set(_MODES) & set(data.get("ctrlmode", ())):
-        findings.say("can.mode", _MODES[mode])
+        findings.add("can.mode", _MODES[mode])

@@ -56,7 +56,7 @@ def check_port(
         if named:
             there = f". Available in /dev/serial/by-id: {named}"
         case = "no_port" if status else "none"
-        findings.say("port.exists", case, there=there)
+        findings.add("port.exists", case, there=there)
         return findings.found
     usb = _adapter(machine, machine.real(f"{hardware}/device"))
     what = tty
@@ -64,22 +64,22 @@ def check_port(
         product = machine.text(f"{usb}/product")
         what = ", ".join(filter(None, [tty, product]))
     case = "pty" if is_pty else "ok"
-    findings.say("port.exists", case, what=what)
+    findings.add("port.exists", case, what=what)
     if diagnosis:
-        findings.say("port.telemetry", "none", diagnosis=diagnosis)
+        findings.add("port.telemetry", "none", diagnosis=diagnosis)
     case = _permission(machine, port, status)
     group = machine.group_name(status.st_gid)
-    findings.say("port.permission", case, group=group)
+    findings.add("port.permission", case, group=group)
     _users(machine, findings, status, is_pty)
     if is_pty:
         return findings.found
     if usb and port.startswith("/dev/tty"):
         better = _stable_name(machine, real, usb)
         case = "unstable" if better else "no_udev"
-        findings.say("port.name", case, better=better)
+        findings.add("port.name", case, better=better)
     _writers(machine, findings, tty, usb)
     if even_parity and is_mini_uart(f"/dev/{tty}", machine.root):
-        findings.say("port.parity", "mini_uart")
+        findings.add("port.parity", "mini_uart")
     return findings.found
 
 
@@ -142,34 +142,34 @@ def _users(machine: Machine, findings: Findings, status: os.stat_result, is_pty:
         elif not is_pty:
             others.append(process)
     for process in own:
-        findings.say("port.users", "gateway", who=process)
+        findings.add("port.users", "gateway", who=process)
     if others:
         who = ", ".join(map(str, others))
         pids = " ".join(str(process.pid) for process in others)
-        findings.say("port.users", "others", who=who, pids=pids)
+        findings.add("port.users", "others", who=who, pids=pids)
     if not own and not others:
         sees_all = is_pty or machine.user == "root"
-        findings.say("port.users", "ok" if sees_all else "unseen")
+        findings.add("port.users", "ok" if sees_all else "unseen")
 
 
 def _writers(machine: Machine, findings: Findings, tty: str, usb: str) -> None:
     """Check that no console of the kernel, no login prompt and no service writes to the ESC."""
     consoles = machine.text("/sys/class/tty/console/active").split()
     case = "console" if tty in consoles else "ok"
-    findings.say("port.console", case)
+    findings.add("port.console", case)
     prompts = []
     for process in machine.processes:
         arguments = [word.rpartition("/")[2] for word in process.words[1:]]
         if "getty" in process.name and tty in arguments:
             prompts.append(str(process))
     case = "getty" if prompts else "ok"
-    findings.say("port.getty", case, who=", ".join(prompts))
+    findings.add("port.getty", case, who=", ".join(prompts))
     if not usb:
         return
     names = {process.name for process in machine.processes}
     places = [f"{top}/{_RULES}" for top in ("/etc", "/usr/lib", "/lib")]
     has_rules = any(map(machine.exists, places))
     if "ModemManager" in names and not has_rules:
-        findings.say("port.modem_manager", "runs")
+        findings.add("port.modem_manager", "runs")
     if "brltty" in names:
-        findings.say("port.brltty", "runs")
+        findings.add("port.brltty", "runs")

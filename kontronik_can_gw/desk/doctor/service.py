@@ -55,14 +55,14 @@ def check_service(machine: Machine, findings: Findings, unit: Unit | None, confi
             is_packaged = any(
                 machine.exists(f"{folder}/{NAME}.service") for folder in _UNIT_FOLDERS
             )
-            findings.say(
+            findings.add(
                 "machine.service",
                 "not_booted" if is_packaged else "no_systemd",
                 unit=name,
                 file=config,
             )
         else:
-            findings.say("machine.service", "none")
+            findings.add("machine.service", "none")
         return
     state = unit.shown.get("ActiveState", "")
     restarts = unit.shown.get("NRestarts", "0")
@@ -71,12 +71,12 @@ def check_service(machine: Machine, findings: Findings, unit: Unit | None, confi
     if state not in ("active", "reloading"):
         case = "failed" if state == "failed" else "stopped"
     findings.values["unit"] = unit.name
-    findings.say("machine.service", case, result=result, state=state, restarts=restarts)
+    findings.add("machine.service", case, result=result, state=state, restarts=restarts)
     if not unit.shown.get("UnitFileState", "").startswith("enabled"):
-        findings.say("machine.service_enabled", "no")
+        findings.add("machine.service_enabled", "no")
     user = unit.shown.get("User") or "root"
     if user != machine.user:
-        findings.say("machine.user", "other", user=user, me=machine.user, file=config)
+        findings.add("machine.user", "other", user=user, me=machine.user, file=config)
 
 
 def check_folder(
@@ -111,4 +111,4 @@ def check_folder(
     made = "" if str(there) == folder else ", will be created"
     space = {"free": free // 1_000_000, "needed": needed // 1_000_000}
     names = {"what": what, "folder": folder, "there": there, "user": machine.user}
-    findings.say("config.folder", case, made=made, **names, **space)
+    findings.add("config.folder", case, made=made, **names, **space)

@@ -85,7 +85,7 @@ class Track:
         self.high: float | None = None
         self.history: deque[float | None] = deque(maxlen=HISTORY_S)
 
-    def take(self, value: float) -> None:
+    def add(self, value: float) -> None:
         if self.low is None or value < self.low:
             self.low = value
         if self.high is None or value > self.high:
@@ -189,7 +189,7 @@ class Monitor:
                 esc, source = self._tracked[column]
                 value = esc.converted(source, raw)
                 if isinstance(value, (int, float)):
-                    esc.tracks[source].take(value)
+                    esc.tracks[source].add(value)
 
     def advance(self, now: int) -> int:
         """Set the time and expire the values of missing messages.

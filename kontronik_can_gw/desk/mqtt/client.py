@@ -182,7 +182,7 @@ class MqttClient:
     def _report_connection(self, now: int) -> None:
         if self._reported_connections == 0:
             self._faults.forget("broker")
-            self._faults.say(logging.INFO, f"{self}: connected as {self._client_id}")
+            self._faults.log(logging.INFO, f"{self}: connected as {self._client_id}")
         self._faults.end("broker", f"{self}: connected", now)
         self._reported_connections = self._connections
 

@@ -30,7 +30,7 @@ LEFT_OUT = frozenset({"sent_frames"})
 _ORDER = (Group.LIVE, Group.LINK, Group.INFO, Group.GATEWAY)
 
 
-class Kind(Enum):
+class ColumnType(Enum):
     """The type of a field's values. Any value may be missing."""
 
     FLAG = "flag"
@@ -45,7 +45,7 @@ class Field:
 
     name: str
     unit: str
-    kind: Kind
+    kind: ColumnType
     message: str = ""
     """Name of the CAN message. Empty for values from bytes."""
     texts: tuple[tuple[int, str], ...] = ()
@@ -77,7 +77,7 @@ class Field:
         value = self.value
         assert value is not None
         names = value.names
-        is_whole = self.kind in (Kind.FLAG, Kind.WHOLE)
+        is_whole = self.kind in (ColumnType.FLAG, ColumnType.WHOLE)
 
         def read(esc: Any, status: GatewayStatus, now: int) -> Value:
             found = steps(value, esc, status, now)
@@ -133,13 +133,13 @@ def _fields_of_group(
 
 def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
     high = math.inf if value.high is None else value.high / value.per_unit
-    kind = Kind.FLOAT
+    kind = ColumnType.FLOAT
     if value.names:
-        kind = Kind.TEXT
+        kind = ColumnType.TEXT
     elif value.bit is not None:
-        kind = Kind.FLAG
+        kind = ColumnType.FLAG
     elif value.per_unit == 1 and value.divisor is Divisor.ONE:
-        kind = Kind.WHOLE
+        kind = ColumnType.WHOLE
     return Field(
         name=prefix + value.name,
         unit=value.unit,

@@ -16,11 +16,10 @@ from typing import NamedTuple
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.dbc.view import Freshness
-from kontronik_can_gw.desk.recordings.fields import Field, Kind, Read, distinct
+from kontronik_can_gw.desk.recordings.fields import ColumnType, Field, Read, distinct
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, LogFrame, Sample
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
-from kontronik_can_gw.esc.values import VALUES, Group
-from kontronik_can_gw.esc.values import Kind as ValueKind
+from kontronik_can_gw.esc.values import VALUES, Group, Kind
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import MessagePlan, SendType
@@ -73,7 +72,7 @@ class RowMaker(Output):
         for index, field in enumerate(fields):
             readers = self._readers.setdefault(field.esc, [])
             readers.append((index, field.reader))
-            is_age = field.value is not None and field.value.kind is ValueKind.AGE
+            is_age = field.value is not None and field.value.kind is Kind.AGE
             if is_age and field.esc is not None:
                 self._ages.append((field.esc, index, field.reader))
 
@@ -147,16 +146,16 @@ def fields_of_log(reader: SignalReader, escs: Sequence[EscSettings]) -> list[Fie
         if column.esc is not None and len(escs) > 1:
             prefix = f"{escs[column.esc].name}."
         unit, slope, shift = _to_value(column)
-        kind = Kind.FLOAT
+        kind = ColumnType.FLOAT
         high = column.high
         if (slope, shift) != (1, 0):
             high = (high - shift) / slope
         elif column.texts:
-            kind = Kind.TEXT
+            kind = ColumnType.TEXT
         elif column.is_flag:
-            kind = Kind.FLAG
+            kind = ColumnType.FLAG
         elif column.is_whole:
-            kind = Kind.WHOLE
+            kind = ColumnType.WHOLE
         field = Field(
             name=prefix + column.source,
             unit=unit,

@@ -14,7 +14,7 @@ from itertools import repeat
 from typing import IO, TYPE_CHECKING, Any
 
 from kontronik_can_gw.desk.libraries import missing_library
-from kontronik_can_gw.desk.recordings.fields import TIME, UTC, Field, Kind, Table
+from kontronik_can_gw.desk.recordings.fields import TIME, UTC, ColumnType, Field, Table
 from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock
 from kontronik_can_gw.native import load
 from kontronik_can_gw.times import SECOND
@@ -183,7 +183,7 @@ class TextTable:
         cells = []
         for prefix, one in zip(self._prefixes, self._table.fields, strict=True):
             texts = None
-            if one.kind is Kind.TEXT:
+            if one.kind is ColumnType.TEXT:
                 texts = []
                 for number, text in one.texts:
                     texts.append((number, self._text(text).encode()))
@@ -232,7 +232,7 @@ class ParquetTable:
         provenance = json.dumps(dict(table.provenance), ensure_ascii=False)
         self._schema = pa.schema(heads, metadata={"kontronik_can_gw": provenance})
         # a dictionary costs more than it saves if all values differ, or if a value takes one byte
-        plain = {one.header for one in table.fields if one.kind is Kind.FLAG}
+        plain = {one.header for one in table.fields if one.kind is ColumnType.FLAG}
         plain.add(f"{TIME} [s]")
         names = self._schema.names
         self._writer: Any = parquet.ParquetWriter(
@@ -294,9 +294,9 @@ class ParquetTable:
         values = pa.py_buffer(made.values(index))
         found = pa.Array.from_buffers(kind, block.end, [valid, values])
         found = found[block.begin :]
-        if one.kind is Kind.FLAG:
+        if one.kind is ColumnType.FLAG:
             return found.cast(pa.int8(), safe=False)
-        if one.kind is not Kind.TEXT:
+        if one.kind is not ColumnType.TEXT:
             return found
         numbers, texts = self._texts[index]
         places = self._compute.index_in(found, numbers)
@@ -311,11 +311,11 @@ class ParquetTable:
 
     def _type(self, one: Field) -> Any:
         pa = self._pa
-        if one.kind is Kind.TEXT:
+        if one.kind is ColumnType.TEXT:
             return pa.dictionary(pa.int32(), pa.string())
-        if one.kind is Kind.FLAG:
+        if one.kind is ColumnType.FLAG:
             return pa.int8()
-        if one.kind is Kind.FLOAT:
+        if one.kind is ColumnType.FLOAT:
             return pa.float64()
         if _MAX_INT64 <= one.high <= 2 * _MAX_INT64:
             return pa.uint64()

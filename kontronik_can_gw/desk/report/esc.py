@@ -12,7 +12,7 @@ from math import isfinite
 from operator import attrgetter, ne
 from typing import Any, Literal, NamedTuple
 
-from kontronik_can_gw.desk.recordings.fields import Field, Kind
+from kontronik_can_gw.desk.recordings.fields import ColumnType, Field
 from kontronik_can_gw.desk.report.quantities import (
     COMPUTED_FROM,
     COUNTERS,
@@ -60,7 +60,7 @@ class Extreme(NamedTuple):
 
 
 @dataclass(slots=True)
-class Event:
+class FlightEvent:
     """An event of an ESC."""
 
     kind: EventKind
@@ -77,20 +77,20 @@ class Event:
     """Index in PHASES of an operating state. None for other events."""
 
 
-class Events:
+class FlightEvents:
     """The events of all ESCs. An event that lasts is stored under a key until it is ended."""
 
     def __init__(self) -> None:
-        self._kept: dict[EventKind, list[Event]] = {
+        self._kept: dict[EventKind, list[FlightEvent]] = {
             "error": [],
             "state": [],
             "link": [],
             "device": [],
         }
-        self._open: dict[Hashable, Event] = {}
+        self._open: dict[Hashable, FlightEvent] = {}
         self.left_out = 0
 
-    def begin(self, key: Hashable, event: Event) -> None:
+    def begin(self, key: Hashable, event: FlightEvent) -> None:
         """Add an event that lasts until ``end`` is called with its key."""
         self._open[key] = event
         if len(self._kept[event.kind]) < MAX_EVENTS:
@@ -110,9 +110,9 @@ class Events:
         if lost:
             event.note = "until telemetry was lost"
 
-    def in_order(self) -> list[Event]:
+    def in_order(self) -> list[FlightEvent]:
         """Return all events, sorted by their begin."""
-        found: list[Event] = []
+        found: list[FlightEvent] = []
         for events in self._kept.values():
             found += events
         return sorted(found, key=attrgetter("begin_ns", "esc"))
@@ -137,7 +137,7 @@ class EscFlight:
         index: int,
         settings: EscSettings,
         fields: Sequence[Field],
-        events: Events,
+        events: FlightEvents,
     ) -> None:
         self.name = settings.name
         self.telemetry_ns = 0
@@ -167,7 +167,7 @@ class EscFlight:
         self._floats: set[str] = set()
         """Values in CAN frames that may be infinite, which means not available."""
         for field in fields:
-            if field.signal and field.kind is Kind.FLOAT:
+            if field.signal and field.kind is ColumnType.FLOAT:
                 self._floats.add(field.source)
         live = [source for source in LIVE if source in self._columns]
         self._live = live[0] if live else None
@@ -197,7 +197,7 @@ class EscFlight:
             return None
         return self._energy / HOUR_NS
 
-    def take(
+    def evaluate(
         self, times: Sequence[int], chunk: Sequence[Sequence[Any]]
     ) -> list[Sequence[int | float | None]]:
         """Evaluate rows that are given as columns. Return the columns to draw."""
@@ -317,7 +317,7 @@ class EscFlight:
             self._events.end(key, now)
             if is_lost:
                 self.gaps += 1
-                event = Event("link", self._index, now, "No telemetry", "warning")
+                event = FlightEvent("link", self._index, now, "No telemetry", "warning")
                 self._events.begin(key, event)
 
     def _name_device(self, now: int, device: Any, raw: Any, variant: Any, *version: Any) -> None:
@@ -335,7 +335,7 @@ class EscFlight:
         if self.devices:
             key = (self._index, "device")
             change = f"Device changed from {self.devices[-1]} to {text}"
-            event = Event("device", self._index, now, change)
+            event = FlightEvent("device", self._index, now, change)
             self._events.begin(key, event)
             self._events.end(key, now)
         self.devices.append(text)
@@ -355,7 +355,7 @@ class EscFlight:
             text = state.text
             if state.phase in PHASES:
                 phase = state.phase
-        event = Event("state", self._index, now, text, phase=PHASES.index(phase))
+        event = FlightEvent("state", self._index, now, text, phase=PHASES.index(phase))
         if phase == "Fault":
             event.severity = "error"
         self._events.begin(key, event)
@@ -368,7 +368,7 @@ class EscFlight:
             self._events.end(key, now, lost=is_lost)
         if was_set or not is_set:
             return
-        event = Event("error", self._index, now, f"unknown bit {bit}", "error")
+        event = FlightEvent("error", self._index, now, f"unknown bit {bit}", "error")
         for known in self._protocol.errors[word]:
             if known != bit:
                 continue

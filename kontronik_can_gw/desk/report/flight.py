@@ -12,7 +12,14 @@ from typing import NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import Field, column_of
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Block
-from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight, Event, Events, Number
+from kontronik_can_gw.desk.report.esc import (
+    DEVICE,
+    LIVE,
+    EscFlight,
+    FlightEvent,
+    FlightEvents,
+    Number,
+)
 from kontronik_can_gw.desk.report.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -93,7 +100,7 @@ class Flight:
         """Two rows further apart than this have a gap between them."""
         self._blank = ((None,),) * len(fields)
         self._gateway_state = column_of(fields, "gateway_state", None)
-        self.seen = Events()
+        self.seen = FlightEvents()
         self._has_begun = False
         self.origin_ns = 0
         """Time of the recording's first row, which is time 0 of the page."""
@@ -120,7 +127,7 @@ class Flight:
         """Times and columns of all lines."""
         self.lines: dict[tuple[int, str], list[Number]] = {}
         """The points to draw, by ESC and source. Complete after ``finish``."""
-        self.events: list[Event] = []
+        self.events: list[FlightEvent] = []
         """All events, sorted by their begin. Complete after ``finish``."""
 
     @property
@@ -128,7 +135,7 @@ class Flight:
         """True if the fields have a value that can be drawn."""
         return bool(self._drawn)
 
-    def take(self, block: Block) -> bool:
+    def evaluate(self, block: Block) -> bool:
         """Evaluate rows. Return False if all later rows are after the window."""
         if not self._has_begun:
             self._has_begun = True
@@ -212,7 +219,7 @@ class Flight:
                 self.replayed = True
         drawn: list[Sequence[Number]] = []
         for esc in self.escs:
-            drawn += esc.take(times, columns)
+            drawn += esc.evaluate(times, columns)
         self.points.feed(times, drawn)
 
 

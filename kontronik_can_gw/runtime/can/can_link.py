@@ -191,7 +191,7 @@ class CanLink:
             self._conditions.end(self.opening_condition, text, now)
         elif not self._conditions.is_on(self.condition):
             # After a failure, the recovery is logged when the first frame is sent.
-            self._conditions.say(logging.INFO, text)
+            self._conditions.log(logging.INFO, text)
 
     def _close_port(self) -> None:
         self.transmitter.forget_failures()

@@ -129,13 +129,13 @@ class EscPort:
         if self._conditions.is_on(self.log.port_condition):
             self._conditions.end(self.log.port_condition, text, now)
         else:
-            self._conditions.say(logging.INFO, text)
+            self._conditions.log(logging.INFO, text)
         if self._protocol.even_parity and is_mini_uart(port.path):
             text = (
                 f"{self.name}: {port.path} is a Raspberry Pi's mini-UART, which does not support even "
                 "parity. Some or all frames may be lost. Use ttyAMA0."
             )
-            self._conditions.say(logging.WARNING, text)
+            self._conditions.log(logging.WARNING, text)
 
     def is_at(self, path: str) -> bool:
         """Return True if a path leads to this ESC, even under another name."""
@@ -332,7 +332,7 @@ class EscLog:
         elif conditions.is_on(self._quality_condition):
             conditions.end(self._quality_condition, said, now)
         else:
-            conditions.say(logging.INFO, said)
+            conditions.log(logging.INFO, said)
 
     @property
     def diagnosis(self) -> str | None:

@@ -83,7 +83,7 @@ class FaultLog:
                 f"{text.removesuffix('.')}. "
                 "This happens often. The next line appears after a minute without it."
             )
-        self.say(level, text)
+        self.log(level, text)
 
     def event(self, name: str, text: str, now: int, level: int = logging.WARNING) -> None:
         """Log a condition that has already ended."""
@@ -101,7 +101,7 @@ class FaultLog:
         lasted_ns = now - condition.begun
         condition.begun = None
         if not condition.flaps:
-            self.say(logging.INFO, f"{text}, after {duration(lasted_ns)}{counts}")
+            self.log(logging.INFO, f"{text}, after {duration(lasted_ns)}{counts}")
 
     def forget(self, name: str) -> None:
         """End a condition without a line, because another line implies its end."""
@@ -127,12 +127,12 @@ class FaultLog:
                 text = (
                     f"{name}: happened {condition.count} more times, but no longer often. {state}"
                 )
-                self.say(logging.INFO, text)
+                self.log(logging.INFO, text)
                 condition.flaps = False
                 condition.count = 0
                 condition.begins.clear()
 
-    def say(self, level: int, text: str) -> None:
+    def log(self, level: int, text: str) -> None:
         """Log a line, and remember it for the status document."""
         if self._held is not None:
             self._held.append((level, text))
@@ -149,7 +149,7 @@ class FaultLog:
         held = self._held or []
         self._held = None
         for level, text in held:
-            self.say(level, text)
+            self.log(level, text)
 
 
 def duration(ns: int) -> str:

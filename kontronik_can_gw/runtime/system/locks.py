@@ -153,7 +153,7 @@ class IdLocks:
         self._config = config
         self._gateway = gateway
         self._conditions = conditions
-        self._locks = Locks(report=lambda text: conditions.say(logging.WARNING, text))
+        self._locks = Locks(report=lambda text: conditions.log(logging.WARNING, text))
         self._names: list[str] = []
 
     def lock(self, at_start: bool = False) -> None:
@@ -172,7 +172,7 @@ class IdLocks:
         for taken in all_taken:
             if at_start:
                 raise in_use(taken)
-            self._conditions.say(logging.ERROR, str(in_use(taken)))
+            self._conditions.log(logging.ERROR, str(in_use(taken)))
 
     def close(self) -> None:
         """Release the locks."""
