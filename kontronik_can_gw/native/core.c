@@ -95,6 +95,8 @@ enum {
     NO_FORM
 };
 
+enum { HEADER_SIZE = KCG_PREFIX_SIZE + 1 }; /* The prefix, then L or I. */
+
 /* Counts the bytes b[from] to b[to - 1] as dropped: under `blame` before `blame_until`, then under
    `reason`. */
 static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reason)
@@ -116,7 +118,7 @@ static void drop(kcg_esc *e, const uint8_t *b, size_t from, size_t to, int reaso
     e->count[reason] += size - blamed;
 }
 
-/* Drops the four bytes of a header that begins no frame, and counts them under `reason`. Of the
+/* Drops the bytes of a header that begins no frame, and counts them under `reason`. Of the
    `length` bytes from the header on, those that are dropped later are counted under it, too. */
 static void reject(kcg_esc *e, const uint8_t *b, size_t at, size_t length, int reason)
 {
@@ -124,7 +126,7 @@ static void reject(kcg_esc *e, const uint8_t *b, size_t at, size_t length, int r
     e->blame = (uint8_t)reason;
     if ((int32_t)(end - e->blame_until) > 0)
         e->blame_until = end;
-    drop(e, b, at, at + 4, KCG_N_DROPPED_NOISE);
+    drop(e, b, at, at + HEADER_SIZE, KCG_N_DROPPED_NOISE);
 }
 
 static int accept_next(kcg *g);
@@ -148,16 +150,16 @@ static void found(kcg *g, kcg_esc *e, int is_info, int v4, const uint8_t *body, 
     memcpy(f->body, body, is_info ? KCG_INFO_SIZE : KCG_LIVE_SIZE);
 }
 
-/* Returns the index of the next K that may begin a header, or `size`. The bytes after it are O and
-   D, as far as there are any. */
+/* Returns the index of the next byte that may begin a header, or `size`. It and the bytes after it
+   are the prefix, as far as there are any. */
 static size_t header_at(const uint8_t *b, size_t from, size_t size)
 {
     while (from < size) {
-        const uint8_t *p = memchr(b + from, 'K', size - from);
+        const uint8_t *p = memchr(b + from, KCG_PREFIX[0], size - from);
         if (!p)
             return size;
         size_t at = (size_t)(p - b), left = size - at;
-        if ((left < 2 || p[1] == 'O') && (left < 3 || p[2] == 'D'))
+        if (!memcmp(p, KCG_PREFIX, left < KCG_PREFIX_SIZE ? left : KCG_PREFIX_SIZE))
             return at;
         from = at + 1;
     }
@@ -168,8 +170,8 @@ static size_t header_at(const uint8_t *b, size_t from, size_t size)
    deframer.has_longer_crc). */
 static int has_longer_crc(const uint8_t *f)
 {
-    size_t covered = forms[0][LEGACY_FORM].length - 4u;
-    return kcg_crc32(0, f, covered) == u32(f + covered);
+    size_t covered = (size_t)forms[0][LEGACY_FORM].length - KCG_CRC_SIZE;
+    return KCG_CRC(0, f, covered) == KCG_READ_CRC(f + covered);
 }
 
 ASSERT_AT_COMPILE_TIME(legacy_live_counter_follows_v4, KCG_N_LIVE_LEGACY == KCG_N_LIVE_V4 + 1);
@@ -183,12 +185,12 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
     e->need = 1;
     while (at < size) {
         size_t start = header_at(b, at, size);
-        if (ended && size - start < 3)
+        if (ended && size - start < KCG_PREFIX_SIZE)
             start = size;
         drop(e, b, at, start, KCG_N_DROPPED_NOISE);
         at = start;
         size_t have = size - at;
-        if (have < 4) {
+        if (have < HEADER_SIZE) {
             if (ended && have) {
                 drop(e, b, at, size, KCG_N_DROPPED_INCOMPLETE);
                 at = size;
@@ -196,16 +198,17 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
             break;
         }
         const uint8_t *f = b + at;
-        if (f[3] != 'L' && f[3] != 'I') {
+        uint8_t kind = f[KCG_PREFIX_SIZE];
+        if (kind != 'L' && kind != 'I') {
             e->count[KCG_N_UNKNOWN_KINDS]++;
-            drop(e, b, at, at + 3, KCG_N_DROPPED_UNKNOWN_KIND);
-            at += 3;
+            drop(e, b, at, at + KCG_PREFIX_SIZE, KCG_N_DROPPED_UNKNOWN_KIND);
+            at += KCG_PREFIX_SIZE;
             continue;
         }
         /* Try the legacy form first, because it is shorter. The CRC of the V4 form begins with the
            same bytes, so it is continued from there. The loop ends with the form whose CRC is
            right, with a form for which bytes are missing, or with NO_FORM. */
-        int is_info = f[3] == 'I', form = KCG_LEGACY ? LEGACY_FORM : V4_FORM;
+        int is_info = kind == 'I', form = KCG_LEGACY ? LEGACY_FORM : V4_FORM;
         uint32_t crc = 0;
         size_t missing = 0, covered = 0;
         for (; form < NO_FORM; form++) {
@@ -214,9 +217,9 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
                 missing = n - have;
                 break;
             }
-            crc = kcg_crc32(crc, f + covered, forms[is_info][form].covered - covered);
+            crc = KCG_CRC(crc, f + covered, forms[is_info][form].covered - covered);
             covered = forms[is_info][form].covered;
-            if (crc == u32(f + n - 4))
+            if (crc == KCG_READ_CRC(f + n - KCG_CRC_SIZE))
                 break;
         }
         if (form == NO_FORM) {
@@ -224,18 +227,18 @@ static size_t scan(kcg *g, kcg_esc *e, const uint8_t *b, size_t size, int ended)
             e->count[KCG_N_CRC_ERRORS]++;
             e->count[KCG_N_LONGER_CRCS] += !is_info && has_longer_crc(f);
             reject(e, b, at, forms[is_info][V4_FORM].length, KCG_N_DROPPED_CRC);
-            at += 4;
+            at += HEADER_SIZE;
         } else if (!missing) {
             e->count[KCG_N_HEADERS]++;
             e->count[(is_info ? KCG_N_INFO_V4 : KCG_N_LIVE_V4) + (form == LEGACY_FORM)]++;
             at += forms[is_info][form].length;
             uint32_t end = e->base + (uint32_t)at;
             e->blame_until = end;
-            found(g, e, is_info, form == V4_FORM, f + 4, end);
+            found(g, e, is_info, form == V4_FORM, f + HEADER_SIZE, end);
         } else if (ended) {
             e->count[KCG_N_HEADERS]++;
             reject(e, b, at, have, KCG_N_DROPPED_INCOMPLETE);
-            at += 4;
+            at += HEADER_SIZE;
         } else {
             e->need = (uint8_t)missing;
             break;

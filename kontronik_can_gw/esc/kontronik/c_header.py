@@ -8,7 +8,15 @@ installation compiles the core before it installs anything.
 import struct
 from collections.abc import Iterator
 
-from kontronik_can_gw.esc.kontronik.codec import FORMS, MAX_LENGTH, MIN_LENGTH, Form, WireLayout
+from kontronik_can_gw.esc.kontronik.codec import (
+    CRC_LENGTH,
+    FORMS,
+    MAX_LENGTH,
+    MIN_LENGTH,
+    PREFIX,
+    Form,
+    WireLayout,
+)
 from kontronik_can_gw.esc.kontronik.fields import (
     VARIANT_BITS,
     DataType,
@@ -38,6 +46,7 @@ def wire_header() -> str:
         _HEAD,
         _types(),
         _sizes(),
+        _header_and_crc(),
         _forms(),
         _fields("LIVE", LiveData, f"/* Live data (KODL). {_OFFSET_NOTE} */"),
         _fields("INFO", InfoData, f"/* Info data (KODI). {_OFFSET_NOTE} */"),
@@ -67,6 +76,21 @@ def _sizes() -> str:
     )
     lines = [f"enum {{ {name} = {number} }}; /* {about} */" for name, number, about in numbers]
     return "\n".join([*lines, ""])
+
+
+def _header_and_crc() -> str:
+    lines = [
+        "/* A header is this prefix, then L or I. Each of its letters is in it once. */",
+        f'#define KCG_PREFIX "{PREFIX.decode()}"',
+        f"enum {{ KCG_PREFIX_SIZE = {len(PREFIX)} }};",
+        "",
+        "/* The CRC of bytes, continued from `crc`, and the CRC at the end of a frame. */",
+        f"enum {{ KCG_CRC_SIZE = {CRC_LENGTH} }};",
+        "#define KCG_CRC(crc, bytes, size) kcg_crc32(crc, bytes, size)",
+        "#define KCG_READ_CRC(bytes) u32(bytes)",
+        "",
+    ]
+    return "\n".join(lines)
 
 
 def _forms() -> str:

@@ -18,6 +18,10 @@ from zlib import crc32
 from kontronik_can_gw.esc.decoder import FrameForm
 from kontronik_can_gw.esc.kontronik.fields import Data, DataType, InfoData, LiveData, body_format
 
+PREFIX = b"KOD"
+"""The beginning of a header. L or I follows. No letter is in a header twice."""
+CRC_LENGTH = 4
+
 
 class WireLayout(Enum):
     """The two layouts of frames. Every device uses one of them for all its frames."""
@@ -32,7 +36,7 @@ class Form(FrameForm):
     def __init__(self, is_info: bool, layout: WireLayout) -> None:
         self.layout = layout
         self.name = f"{'info' if is_info else 'live'}_{layout.value}"
-        self.header = b"KODI" if is_info else b"KODL"
+        self.header = PREFIX + (b"I" if is_info else b"L")
         self.data_type: DataType = InfoData if is_info else LiveData
         body = body_format(self.data_type)
         reserved = 0

@@ -17,9 +17,11 @@ from zlib import crc32
 
 from kontronik_can_gw.esc.decoder import Reading
 from kontronik_can_gw.esc.kontronik.codec import (
+    CRC_LENGTH,
     FORMS,
     FORMS_BY_HEADER,
     MAX_LENGTH,
+    PREFIX,
     Form,
     WireLayout,
 )
@@ -28,7 +30,7 @@ from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
 
 _new = tuple.__new__
 _LEGACY_LIVE = next(form for form in FORMS if form.name == "live_legacy")
-_PREFIX = b"KOD"
+_HEADER_LENGTH = len(PREFIX) + 1
 _LONG_RUNS = bytes(0x100 - (1 << n) for n in range(8)) + b"\0"
 """Bytes whose bits are sent as zeros followed by ones.
 
@@ -171,7 +173,7 @@ def has_longer_crc(frame: bytes) -> bool:
     One receiver in the field accepts such frames. No recording of one is public.
     """
     (found,) = _LEGACY_LIVE.unpack_crc(frame)
-    return bool(crc32(frame[: _LEGACY_LIVE.length - 4]) == found)
+    return bool(crc32(frame[: _LEGACY_LIVE.length - CRC_LENGTH]) == found)
 
 
 class Deframer:
@@ -228,7 +230,7 @@ class Deframer:
         missing = 0
         while at < size:
             frame = buffer[at : at + MAX_LENGTH]
-            forms = FORMS_BY_HEADER.get(frame[:4])
+            forms = FORMS_BY_HEADER.get(frame[:_HEADER_LENGTH])
             if forms is None:
                 start = self._skip(buffer, at, has_ended)
                 if start == at:
@@ -254,13 +256,13 @@ class Deframer:
                 if forms[0] is _LEGACY_LIVE and has_longer_crc(frame):
                     counters.longer_crcs += 1
                 self._reject(buffer, at, form.length, "dropped_crc")
-                at += 4
+                at += _HEADER_LENGTH
             if missing:
                 if not has_ended:
                     break
                 missing = 0
                 self._reject(buffer, at, size - at, "dropped_incomplete")
-                at += 4
+                at += _HEADER_LENGTH
         counters.headers += len(frames)
         self._held = buffer[at:]
         self._needed = missing or 1
@@ -273,16 +275,16 @@ class Deframer:
         Returns ``at`` if the bytes there may be the beginning of a header.
         """
         size = len(buffer)
-        start = buffer.find(_PREFIX, at)
+        start = buffer.find(PREFIX, at)
         if start < 0:
             start = size
             if not has_ended:
-                start -= _length_of_partial_prefix(buffer[max(at, size - 2) :])
+                start -= _length_of_partial_prefix(buffer[max(at, size - len(PREFIX) + 1) :])
         if start > at:
             self._drop(buffer, at, start)
-        elif size - at >= 4:
+        elif size - at >= _HEADER_LENGTH:
             self.counters.unknown_kinds += 1
-            start += 3
+            start += len(PREFIX)
             self._drop(buffer, at, start, "dropped_unknown_kind")
         elif has_ended:
             start = size
@@ -303,7 +305,7 @@ class Deframer:
         self.counters.headers += 1
         self._rejected_for = reason
         self._rejected_until = max(self._rejected_until, self._base + at + length)
-        self._drop(buffer, at, at + 4)
+        self._drop(buffer, at, at + _HEADER_LENGTH)
 
     def _drop(
         self,
@@ -324,9 +326,8 @@ class Deframer:
 
 
 def _length_of_partial_prefix(tail: bytes) -> int:
-    """Return how many of the last bytes may be the beginning of a header: 0, 1 or 2."""
-    if tail == _PREFIX[:2]:
-        return 2
-    if tail.endswith(_PREFIX[:1]):
-        return 1
+    """Return how many of the last bytes may be the beginning of a header."""
+    for length in range(len(PREFIX) - 1, 0, -1):
+        if tail.endswith(PREFIX[:length]):
+            return length
     return 0
