@@ -1,17 +1,18 @@
 # Each target installs its requirements in .venv. Only Python 3.11 or newer must be installed before.
 # ARGS is passed to the program: make demo ARGS=--help, make test ARGS='--only unit -- -k crc'
 .POSIX:
-.PHONY: help demo test test-all release soak hour bench conformance golden docs pictures wheels deb lint prose clean
+.PHONY: help demo test test-all prove release soak hour bench conformance golden docs pictures wheels deb lint prose clean
 
 help:
 	@echo 'make demo      show the gateway at work without hardware   (ARGS=--help)'
 	@echo 'make test      ruff, mypy, tests, and the most important tests on a real vcan'
 	@echo '               (ARGS="--only lint|types|unit|vcan -- -k crc")'
 	@echo 'make test-all  the slower tests: faults, systemd, browser, MQTT broker, CANopen masters'
-	@echo '               of other projects   (ARGS="--only faults|tools|masters")'
+	@echo '               of other projects   (ARGS="--only faults|tools|masters|prove")'
+	@echo 'make prove     the proofs of docs/proof.md that end within 5 min; a part of make test-all'
 	@echo 'make release   tests that take hours, on a quiet machine: faults on emulated hardware,'
 	@echo '               random faults, a recorded hour'
-	@echo '               (ARGS="--only qemu|soak|hour|put-in|machines|fuzz|wheels|deb")'
+	@echo '               (ARGS="--only qemu|soak|hour|put-in|machines|fuzz|proofs|wheels|deb")'
 	@echo 'make soak      random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
 	@echo 'make hour      convert a recorded hour to every format, read it back and compare'
 	@echo '               (ARGS="--minutes 6")'
@@ -43,6 +44,10 @@ test:
 test-all:
 	@tests/bootstrap.sh test-all
 	@.venv/bin/python tests/run.py test-all $(ARGS)
+
+prove:
+	@tests/bootstrap.sh prove
+	@.venv/bin/python tests/run.py prove $(ARGS)
 
 release:
 	@tests/bootstrap.sh release

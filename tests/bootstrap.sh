@@ -1,12 +1,13 @@
 #!/bin/sh
 # Creates .venv with the project on a fresh Debian or Ubuntu.
-#   bootstrap.sh demo|lint|test|test-all|pictures|wheels|release
+#   bootstrap.sh demo|lint|test|test-all|prove|pictures|wheels|release
 #   demo      the project
 #   lint      the same and its test tools
 #   test      the same and small tools of some tests. If the kernel has no vcan for this user, also
 #             User Mode Linux, which needs root or a sudo without a password.
 #   test-all  the same, User Mode Linux in any case, systemd, a browser, an MQTT broker, and CANopen
 #             masters of other projects (tests/foreign)
+#   prove     `lint` and a C compiler
 #   pictures  `lint` and a browser
 #   wheels    `lint`, cross compilers and qemu-user
 #   release   `test` and both virtual machines of the fault programme, which are User Mode Linux and
@@ -14,7 +15,7 @@
 # A second call has no effect. PYTHON is the interpreter to use.
 set -eu
 
-what=${1:?demo, lint, test, test-all, pictures, wheels or release}
+what=${1:?demo, lint, test, test-all, prove, pictures, wheels or release}
 cd "$(dirname "$0")/.."
 venv=.venv/bin/python
 new_enough='import sys; sys.exit(sys.version_info < (3, 11))'
@@ -228,9 +229,10 @@ case $what in
         install_other_machines
         install_programs "Debian packages in fresh roots" debootstrap lintian
         ;;
+    prove) install_compiler; install_project test '.[test]' ;;
     pictures) install_project test '.[test]'; install_browser ;;
     wheels) install_project test '.[test]'; install_cross_compilers ;;
-    *) die "$what: demo, lint, test, test-all, pictures, wheels or release" ;;
+    *) die "$what: demo, lint, test, test-all, prove, pictures, wheels or release" ;;
 esac
 packages=$(echo "$lacks" | tr -s ' ' '\n' | sort -u | tr '\n' ' ')
 [ -z "$lacks" ] || say "tests are left out, for there is no right to install $left_out. By hand:  sudo apt-get install$packages"

@@ -1,6 +1,6 @@
-"""Runs one tier of the project's checks. `make test`, `make test-all` and `make release` call it.
+"""Runs one tier of the project's checks, for the targets of the Makefile with the same names.
 
-    python tests/run.py test|test-all|release [--only STEP]... [-- PYTEST-ARGUMENTS...]
+    python tests/run.py test|test-all|prove|release [--only STEP]... [-- PYTEST-ARGUMENTS...]
 
 test, before every commit:
   lint      ruff
@@ -14,6 +14,9 @@ test-all, the slow checks and the checks with other programs:
             It repeats the tests marked "rights": CI runs `test` as an ordinary user and
             `test-all` as root.
   masters   tests marked "extended" on a vcan, with CANopen masters of other projects
+  prove     the proofs of docs/proof.md that end within five minutes
+
+prove, the same step alone
 
 release, by hand on a quiet machine:
   qemu      the fault programme on emulated hardware
@@ -22,6 +25,7 @@ release, by hand on a quiet machine:
   put-in    a list of faults that the tests must detect
   machines  the exported core on other machines
   fuzz      the C core under fuzzers, ten minutes each
+  proofs    the proofs that need longer
   wheels    wheels for other machines
   deb       the Debian packages in fresh roots of both releases
 
@@ -65,16 +69,20 @@ ON_VCAN = (
     "python tests/vm/vm_run.py --timeout=1500 --rw={scratch} -- "
     f"{PYTEST} -p no:cacheprovider tests/vcan"
 )
+ELSEWHERE = "--ignore=tests/vcan --ignore=tests/proofs"
+"""Folders with steps of their own."""
 FUZZ_OPTIONS = "-s -o faulthandler_timeout=900"
+PROOF_OPTIONS = "-o faulthandler_timeout=3600"
 FAULTS = "python tests/faults/programme.py {0} --junit={{report}}"
 STEPS = {
     "lint": "ruff check . && ruff format --check .",
     "types": "mypy",
-    "unit": f"{PYTEST} -n logical --maxprocesses=8 -m 'not extended' --ignore=tests/vcan {{args}}",
+    "unit": f"{PYTEST} -n logical --maxprocesses=8 -m 'not extended' {ELSEWHERE} {{args}}",
     "vcan": f"{ON_VCAN} -m 'not extended' {{args}}",
     "faults": FAULTS.format("uml"),
-    "tools": f"{PYTEST} -m 'extended or rights' --ignore=tests/vcan {{args}}",
+    "tools": f"{PYTEST} -m 'extended or rights' {ELSEWHERE} {{args}}",
     "masters": f"{ON_VCAN} -m extended {{args}}",
+    "prove": f"{PYTEST} -n 2 tests/proofs {{args}}",
     "qemu": FAULTS.format("qemu"),
     "soak": FAULTS.format("soak") + " --minutes=240",
     "hour": "python tests/hour/hour_programme.py",
@@ -82,14 +90,16 @@ STEPS = {
     "wheels": "python tests/native/wheels.py {scratch}",
     "machines": f"{PYTEST} -s tests/native/on_machines.py",
     "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} {FUZZ_OPTIONS} tests/native/test_fuzz.py",
+    "proofs": f"{PYTEST} -s {PROOF_OPTIONS} tests/proofs/long_proofs.py",
     "deb": f"{PYTEST} -o faulthandler_timeout=900 tests/deb/in_fresh_roots.py",
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
-    "test-all": (("masters", "faults"), ("tools",)),
-    "release": (("qemu", "soak", "hour", "put-in", "machines", "fuzz", "wheels", "deb"),),
+    "test-all": (("masters", "faults"), ("tools", "prove")),
+    "prove": (("prove",),),
+    "release": (("qemu", "soak", "hour", "put-in", "machines", "fuzz", "proofs", "wheels", "deb"),),
 }
-LIMIT_S = {"test": 1800, "test-all": 2400, "release": 6 * 3600}
+LIMIT_S = {"test": 1800, "test-all": 2400, "prove": 1200, "release": 6 * 3600}
 """Longest duration of one step. The two tiers that CI runs end within its 90 minutes."""
 ENABLE_UML = "sudo apt-get install user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
 ENABLE_CROSS = (
