@@ -5,6 +5,7 @@ python -m pytest -s tests/proofs/long_proofs.py
 
 from pathlib import Path
 
+from every_value import compare_values
 from scaled_frames import WHOLE_PREFIX
 from test_small_scope import SYMBOLS_IN_C, prove_in_c
 
@@ -13,3 +14,12 @@ def test_all_short_streams_give_the_frames_of_brute_force_with_the_whole_prefix(
     tmp_path: Path,
 ) -> None:
     prove_in_c(tmp_path, WHOLE_PREFIX, SYMBOLS_IN_C)
+
+
+def test_every_electrical_speed_is_packed_as_the_sheet_and_the_dbc_demand(tmp_path: Path) -> None:
+    assert compare_values(tmp_path, "speed").values == (1 << 32) + 1
+
+
+def test_every_power_is_packed_as_the_sheet_and_the_dbc_demand(tmp_path: Path) -> None:
+    """Every battery voltage with every battery current."""
+    assert compare_values(tmp_path, "power").values == (1 << 32) + 1
