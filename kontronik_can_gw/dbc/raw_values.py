@@ -32,13 +32,12 @@ class ValueTable:
         self.error = self._first(_ERROR)
         self.special: list[int] = []
         """Raw values that are codes."""
-        for text, raw in self.codes.items():
-            if text in _CODES:
-                self.special.append(raw)
         self.texts: dict[int, str] = {}
         """Entries that are values."""
         for raw, text in self.entries.items():
-            if normalize(text) not in _CODES:
+            if normalize(text) in _CODES:
+                self.special.append(raw)
+            else:
                 self.texts[raw] = text
 
     def numbers(self, value: Value) -> dict[int, int]:

@@ -202,6 +202,8 @@ class SignalCompiler:
             return self._bound(plan, *found)
         role = names.protection(name)
         if role is not None:
+            if role is Role.ALIVE:
+                plan = _counted(plan, self.table)
             can_count = not plan.is_float and plan.low <= 0 and plan.high >= 2
             if role is Role.ALIVE and not can_count:
                 raise UnfitSignal(
@@ -275,6 +277,8 @@ def _bound_plan(
     UnfitSignal if the signal cannot show the value.
     """
     slope, intercept = _scale(plan, value)
+    if value.rolls:
+        plan = _counted(plan, table)
     plan = replace(
         plan,
         role=Role.SOURCE,
@@ -288,18 +292,39 @@ def _bound_plan(
     high = plan.high
     if value.bit is not None and plan.length == 1:
         plan = _flag(plan, on_loss)
-    if value.rolls:
+    elif value.rolls:
         counts = slope == 1 and intercept == 0 and low == 0 and high >= 1
         if plan.is_float or not counts:
             raise UnfitSignal(
                 f"{value.name} is a counter, which needs factor 1, offset 0 and a minimum of 0."
             )
         notes.append(f"starts again at 0 after {high}")
+    elif not plan.is_float and not numbers:
+        _check_codes_of_number(plan, table)
     has_no_code = not plan.is_float and table.not_available is None
     if has_no_code and low <= plan.not_available <= high:
         sent = raw_values.text(plan.not_available * plan.factor + plan.offset)
         notes.append(f"not available is sent as {sent}")
     return replace(plan, numbers=numbers or None, notes=tuple(notes))
+
+
+def _counted(plan: SignalPlan, table: ValueTable) -> SignalPlan:
+    """Return the plan of a counter, which restarts at 0 before the first code."""
+    first = min((raw for raw in table.special if raw >= 0), default=plan.high + 1)
+    return replace(plan, high=min(plan.high, first - 1))
+
+
+def _check_codes_of_number(plan: SignalPlan, table: ValueTable) -> None:
+    """Raise UnfitSignal if a value could be sent as a code of the value table.
+
+    The codes in use are excluded from the values, wherever they are. Any others must be at an end.
+    """
+    for raw in table.special:
+        if plan.low <= raw <= plan.high and raw not in (plan.not_available, plan.error):
+            raise UnfitSignal(
+                f"the value {raw} would be read as {table.entries[raw]!r} of its value table, "
+                "which has a further code with this meaning. Remove one of them."
+            )
 
 
 def _scale(plan: SignalPlan, value: Value) -> tuple[Fraction, Fraction]:

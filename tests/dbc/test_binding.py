@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from dbc_bench import compiled, gateway_with, packed
+from dbc_bench import compiled, gateway_with, packed, refused
 from e2e import p01
 from hypothesis import given
 from hypothesis import strategies as st
@@ -164,6 +164,38 @@ def test_the_code_for_not_available_is_found_by_its_usual_names(text: str) -> No
 def test_the_code_for_an_error_is_found_by_its_usual_names(text: str) -> None:
     signal = Sig("BatteryVoltage", 0, 8, unit="mV", texts={9: text})
     assert raw_of(signal) == 9
+
+
+@pytest.mark.parametrize(("first_code", "sent"), [(7, [6, 0, 1]), (2, [0, 1, 0])])
+def test_a_counter_restarts_at_0_before_the_first_code(first_code: int, sent: list[int]) -> None:
+    signal = Sig("LiveFrames", 0, 8, texts={first_code: "Error"})
+    layout = layout_of([Msg("M", 0x100, 1, [signal])])
+    read: list[int] = []
+    for count in (6, 7, 8):
+        gateway = gateway_with(layout)
+        for _ in range(count):
+            gateway.receive_bytes(0, encode(LIVE, WireLayout.V4), 50 * MS, 50 * MS)
+        read += packed(layout.messages[0], gateway)
+    assert read == sent
+
+
+def test_an_alive_counter_restarts_at_0_before_the_first_code() -> None:
+    signal = Sig("MessageCounter", 0, 4, texts={14: "Error", 5: "NotAvailable"})
+    (plan,) = layout_of([Msg("M", 0x100, 1, [signal])]).messages
+    assert plan.signals[0].high == 4
+
+
+@pytest.mark.parametrize("texts", [{100: "Invalid", 101: "Error"}, {9: "SNA", 8: "SNA"}])
+def test_a_further_code_between_the_values_is_refused(texts: dict[int, str]) -> None:
+    signal = Sig("PwmInput", 0, 16, texts=texts)
+    (line,) = refused(dbc_text([Msg("M", 0x100, 8, [signal])]))
+    assert "further code" in line
+
+
+def test_a_further_code_at_the_end_of_the_range_is_no_value() -> None:
+    texts = {65535: "SNA", 65534: "Error", 65533: "Invalid"}
+    (plan,) = layout_of([Msg("M", 0x100, 8, [Sig("PwmInput", 0, 16, texts=texts)])]).messages
+    assert plan.signals[0].high == 65532
 
 
 # --- alive counter and E2E profile 1

@@ -475,7 +475,8 @@ class Sig:
             return by_text.get(int(value), self.error)
         low, high = self.limits
         if known.rolls:
-            return int(value) % (high + 1)
+            counted = [high + 1, *(code for code in codes.values() if code >= 0)]
+            return int(value) % min(counted)
         exact = (value - Fraction(self.offset)) / Fraction(self.factor)
         raw = math.floor(exact + Fraction(1, 2))
         looks_like_none = raw == self.not_available and self.length > 1
