@@ -14,6 +14,7 @@ EXTRAS = {
     "parquet": "pyarrow>=15",
     "mqtt": "paho-mqtt>=2",
     "metrics": "prometheus-client>=0.20",
+    "prove": "z3-solver>=4.12",
 }
 """The library of each extra in pyproject.toml."""
 

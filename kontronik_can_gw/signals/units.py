@@ -114,6 +114,16 @@ def texts_like(source: str) -> list[str]:
     return [text for quantity, text in _tables()[2] if quantity in known]
 
 
+def shown(text: str) -> dict[str, str]:
+    """Return the spelling to show of each possible unit of a text, by quantity."""
+    found = {}
+    for quantity, unit in meanings(text).items():
+        for other, spelling in _tables()[2]:
+            if other == quantity and meanings(spelling).get(quantity) is unit:
+                found[quantity] = spelling
+    return found
+
+
 def names() -> tuple[str, ...]:
     """Return the spelling to show of every unit."""
     return tuple(dict.fromkeys(text for _, text in _tables()[2]))

@@ -1,0 +1,449 @@
+"""The frames that a DBC defines, derived from its physical values as exact fractions.
+
+This is the specification of the proof. The rest of the package supplies only the user's input: the
+DBC as cantools reads it, the names to which signals bind, and the spellings of
+units. Limits, codes, factors and bit positions are derived here a second time, from the text of
+docs/dbc.md and docs/your-own-dbc.md.
+"""
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.dbc.copies import Copy
+from kontronik_can_gw.dbc.expand import copies_of
+from kontronik_can_gw.dbc.names import Binder, protection
+from kontronik_can_gw.dbc.reader import attribute, choose_node
+from kontronik_can_gw.desk.proof.quantities import QUANTITIES, Quantity, size
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.value_names import normalize
+from kontronik_can_gw.signals import units
+from kontronik_can_gw.signals.plan import Role
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database, Signal
+
+_TEXTS_OF_NOT_AVAILABLE = ("notavailable", "sna", "na", "signalnotavailable")
+_TEXTS_OF_ERROR = ("error", "err", "invalid")
+_HALF = Fraction(1, 2)
+_MOST_WITH_CRC = 15
+"""Number of values of an alive counter beside an E2E CRC."""
+
+
+class Shape(Enum):
+    """The rule by which a signal gets its raw value."""
+
+    NUMBER = "number"
+    FLAG = "flag in one bit"
+    COUNTER = "counter"
+    NAMES = "enumeration"
+    FLOAT = "float"
+    ALIVE = "alive counter"
+    CRC = "CRC"
+    CONSTANT = "constant"
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The meaning of a signal's raw values, and the rule by which they are sent."""
+
+    shape: Shape
+    length: int
+    signed: bool
+    factor: Fraction
+    offset: Fraction
+    minimum: Fraction | None
+    """Smallest physical value. None: no limit."""
+    maximum: Fraction | None
+    not_available: int
+    error: int
+    codes: frozenset[int]
+    """All raw values that mean "not available" or "error"."""
+    quantity: Quantity | None = None
+    esc: int | None = None
+    scale: Fraction = Fraction(1)
+    shift: Fraction = Fraction(0)
+    """``number in the signal's unit = number in the quantity's unit * scale + shift``."""
+    numbers: Mapping[int, int] = field(default_factory=dict)
+    """NAMES: raw value of each number that has a name in the value table."""
+    constant: int = 0
+    has_code: bool = False
+    """True if the value table has a text for "not available"."""
+    modulus: int = 0
+    """COUNTER and ALIVE: number of values."""
+
+    @property
+    def lowest(self) -> int:
+        return -(1 << self.length - 1) if self.signed else 0
+
+    @property
+    def highest(self) -> int:
+        return self.lowest + (1 << self.length) - 1
+
+    def physical(self, raw: int) -> Fraction:
+        return raw * self.factor + self.offset
+
+    def exact(self, value: Fraction) -> Fraction:
+        """Return the exact raw value of a number in the quantity's unit, not rounded yet."""
+        return (value * self.scale + self.shift - self.offset) / self.factor
+
+    def is_value(self, raw: int) -> bool:
+        """Return True if a raw value is within bits and limits, and not a code."""
+        if not self.lowest <= raw <= self.highest or raw in self.codes:
+            return False
+        if self.minimum is None or self.maximum is None:
+            return True
+        return self.minimum <= self.physical(raw) <= self.maximum
+
+
+@dataclass(frozen=True)
+class ExpectedSignal:
+    """A signal on one page."""
+
+    name: str
+    source: str
+    """Name of its value, or "" without a source."""
+    unit: str
+    page: int | None
+    bits: tuple[int, ...]
+    """Position in the frame of each bit of the raw value, counted from bit 0 of byte 0."""
+    rule: Expected | None
+    """None if the specification does not cover the signal."""
+    reason: str = ""
+    """The reason in that case."""
+
+
+@dataclass(frozen=True)
+class ExpectedMessage:
+    """A message on the bus."""
+
+    name: str
+    can_id: int
+    extended: bool
+    length: int
+    pages: tuple[int | None, ...]
+    data_id: int
+    multiplexer: tuple[int, ...]
+    """Bits of the multiplexer. Empty without one."""
+    signals: tuple[ExpectedSignal, ...]
+
+
+def expected_messages(
+    database: "Database", file: str, escs: Sequence[EscSettings], settings: DbcConfig
+) -> Iterator[ExpectedMessage]:
+    """Yield the messages of the gateway in the order of the file."""
+    node = choose_node(database, settings.node, file, settings.messages)
+    binder = Binder(escs, settings.bind)
+    for copy in copies_of(database, file, escs, settings):
+        if node in copy.message.senders:
+            yield _message(database, copy, binder, settings)
+
+
+def _message(
+    database: "Database", copy: Copy, binder: Binder, settings: DbcConfig
+) -> ExpectedMessage:
+    message = copy.message
+    pages: set[int] = set()
+    for signal in message.signals:
+        pages.update(signal.multiplexer_ids or ())
+    multiplexer: tuple[int, ...] = ()
+    signals = []
+    has_crc = _has_crc(copy, binder)
+    for signal in message.signals:
+        if signal.is_multiplexer:
+            multiplexer = bits_of(signal)
+            continue
+        for page in signal.multiplexer_ids or (None,):
+            made = _Signal(database, copy, signal, binder, settings, has_crc).made(page)
+            signals.append(made)
+    return ExpectedMessage(
+        name=copy.name,
+        can_id=copy.frame_id,
+        extended=message.is_extended_frame,
+        length=message.length,
+        pages=tuple(sorted(pages)) or (None,),
+        data_id=settings.e2e_data_ids.get(copy.name, copy.frame_id & 0xFFFF),
+        multiplexer=multiplexer,
+        signals=tuple(signals),
+    )
+
+
+def _has_crc(copy: Copy, binder: Binder) -> bool:
+    for signal in copy.message.signals:
+        bound = binder.bound(copy, signal.name)
+        name = signal.name if bound is None else bound
+        if not isinstance(name, str) or binder.by_name(name, copy.esc) is not None:
+            continue
+        if protection(name) is Role.CRC and not signal.is_multiplexer:
+            return True
+    return False
+
+
+def bits_of(signal: "Signal") -> tuple[int, ...]:
+    """Return the position in the frame of each bit of a raw value, from the least significant.
+
+    A DBC gives the least significant bit of an Intel signal and the most significant bit of a
+    Motorola signal. Both number bits from the least significant bit of byte 0.
+    """
+    if signal.byte_order == "little_endian":
+        return tuple(range(signal.start, signal.start + signal.length))
+    byte, bit = divmod(signal.start, 8)
+    found = []
+    for _ in range(signal.length):
+        found.append(8 * byte + bit)
+        bit -= 1
+        if bit < 0:
+            byte += 1
+            bit = 7
+    return tuple(reversed(found))
+
+
+class _Signal:
+    """Makes the specification of one signal of the file."""
+
+    def __init__(
+        self,
+        database: "Database",
+        copy: Copy,
+        signal: "Signal",
+        binder: Binder,
+        settings: DbcConfig,
+        has_crc: bool,
+    ) -> None:
+        self.database = database
+        self.copy = copy
+        self.signal = signal
+        self.binder = binder
+        self.settings = settings
+        self.has_crc = has_crc
+        self.unit = _unit(signal, settings)
+        texts: list[tuple[int, str]] = []
+        for raw, text in (signal.choices or {}).items():
+            texts.append((int(raw), normalize(str(text))))
+        self.texts = texts
+        self.start, self.start_is_set = self._start_value()
+
+    def made(self, page: int | None) -> ExpectedSignal:
+        """Return the specification on a page."""
+        name = self.copy.prefix + self.signal.name
+        bits = bits_of(self.signal)
+        source = ""
+        rule: Expected | None = None
+        reason = ""
+        bound = self.binder.bound(self.copy, self.signal.name)
+        if isinstance(bound, (int, float)):
+            rule = self._constant((_exact(bound) - self._offset) / self._factor)
+        else:
+            found = self.binder.by_name(bound or self.signal.name, self.copy.esc)
+            if found is not None:
+                value, esc = found
+                source = value.name
+                if not value.supplied:
+                    reason = "its protocol does not supply the value"
+                elif value.name not in QUANTITIES:
+                    reason = f"{value.name} is not in the sheet of the proof"
+                else:
+                    rule = self._with_source(QUANTITIES[value.name], esc, value.names)
+            else:
+                rule = self._without_source(protection(bound or self.signal.name))
+        return ExpectedSignal(name, source, self.unit, page, bits, rule, reason)
+
+    @property
+    def _factor(self) -> Fraction:
+        return _exact(self.signal.scale)
+
+    @property
+    def _offset(self) -> Fraction:
+        return _exact(self.signal.offset)
+
+    def _start_value(self) -> tuple[int | None, bool]:
+        """Return the raw start value, and True if this signal has one of its own.
+
+        None if there is none, or if the signal cannot hold it.
+        """
+        start = attribute(self.signal, "GenSigStartValue", self.database)
+        own = self.signal.dbc is not None and "GenSigStartValue" in self.signal.dbc.attributes
+        if not isinstance(start, (int, float)):
+            return None, own
+        if self.signal.is_float:
+            return _float_bits(start, self.signal.length), own
+        raw = _exact(start)
+        lowest = -(1 << self.signal.length - 1) if self.signal.is_signed else 0
+        fits = raw.denominator == 1 and 0 <= raw - lowest < 1 << self.signal.length
+        return (int(raw) if fits else None), own
+
+    def _raws(self, texts: Sequence[str]) -> list[int]:
+        """Return the raw values whose text in the value table is one of these.
+
+        The first one is sent. If its text is in the table twice, this is the last with the text.
+        """
+        found = [(raw, text) for raw, text in self.texts if text in texts]
+        if found:
+            first = found[0][1]
+            last = [each for each in found if each[1] == first][-1]
+            found.remove(last)
+            found.insert(0, last)
+        return [raw for raw, _ in found]
+
+    def _base(self, shape: Shape, **more: Any) -> Expected:
+        """Return a rule with the limits and codes of the file."""
+        signal = self.signal
+        minimum = maximum = None
+        limits = (signal.minimum, signal.maximum)
+        if None not in limits and limits != (0, 0):
+            minimum, maximum = _exact(signal.minimum), _exact(signal.maximum)
+        named = self._raws(_TEXTS_OF_NOT_AVAILABLE)
+        errors = self._raws(_TEXTS_OF_ERROR)
+        if named:
+            not_available = named[0]
+        elif self.start is not None and (self.start_is_set or signal.length == 1):
+            not_available = self.start
+        elif signal.is_signed:
+            not_available = -(1 << signal.length - 1)
+        else:
+            not_available = (1 << signal.length) - 1
+        given: dict[str, Any] = {
+            "shape": shape,
+            "length": signal.length,
+            "signed": signal.is_signed,
+            "factor": self._factor,
+            "offset": self._offset,
+            "minimum": minimum,
+            "maximum": maximum,
+            "not_available": not_available,
+            "error": errors[0] if errors else not_available,
+            "codes": frozenset((*named, *errors)),
+            "has_code": bool(named),
+        }
+        return Expected(**given | more)
+
+    def _constant(self, raw: Fraction | int | None) -> Expected:
+        """Return the rule of a constant with an exact raw value."""
+        if self.signal.is_float:
+            bits = raw if isinstance(raw, int) else _float_bits(raw or 0, self.signal.length)
+            return self._base(Shape.CONSTANT, constant=bits, codes=frozenset())
+        assert raw is None or raw == int(raw)
+        return self._base(Shape.CONSTANT, constant=int(raw or 0), codes=frozenset())
+
+    def _without_source(self, role: Role | None) -> Expected:
+        """Return the rule of a counter of frames, a CRC, or a signal that is bound to nothing."""
+        if role is Role.CRC:
+            return self._base(Shape.CRC)
+        if role is Role.ALIVE:
+            modulus = self._modulus()
+            return self._base(
+                Shape.ALIVE, modulus=min(modulus, _MOST_WITH_CRC) if self.has_crc else modulus
+            )
+        named = self._raws(_TEXTS_OF_NOT_AVAILABLE)
+        if named and not self.start_is_set:
+            if self.signal.is_float:
+                return self._constant(_float_bits(named[0], self.signal.length))
+            return self._constant(named[0])
+        return self._constant(self.start)
+
+    def _modulus(self) -> int:
+        """Return the number of values of a counter, which restarts before the first code."""
+        rule = self._base(Shape.NUMBER)
+        greatest = rule.highest
+        if rule.maximum is not None and rule.minimum is not None:
+            ends = [(end - rule.offset) / rule.factor for end in (rule.minimum, rule.maximum)]
+            greatest = min(greatest, max(ends).__floor__())
+        codes = [code for code in rule.codes if code >= 0]
+        return min([greatest + 1, *codes])
+
+    def _with_source(
+        self, quantity: Quantity, esc: int | None, names: Mapping[int, str]
+    ) -> Expected:
+        """Return the rule of a signal that shows a value."""
+        scale, shift = _conversion(quantity.unit, self.unit)
+        shape = Shape.FLOAT if self.signal.is_float else Shape.NUMBER
+        base = self._base(shape, quantity=quantity, esc=esc, scale=scale, shift=shift)
+        if self.signal.is_float:
+            return base
+        numbers = self._numbers(names)
+        if numbers:
+            return self._base(Shape.NAMES, quantity=quantity, esc=esc, numbers=numbers)
+        if quantity.rolls:
+            return self._base(
+                Shape.COUNTER,
+                quantity=quantity,
+                esc=esc,
+                modulus=self._modulus(),
+            )
+        has_no_code = not self._raws(_TEXTS_OF_NOT_AVAILABLE)
+        if quantity.is_flag and self.signal.length == 1 and has_no_code:
+            return self._flag(base)
+        # Without a text for it, the code is nevertheless not a value.
+        return self._base(
+            shape,
+            quantity=quantity,
+            esc=esc,
+            scale=scale,
+            shift=shift,
+            codes=base.codes | {base.not_available},
+        )
+
+    def _flag(self, base: Expected) -> Expected:
+        """Return the rule of a flag in one bit, which needs both raw values for its value."""
+        lost = self.settings.flags_on_loss
+        if lost is None and self.start_is_set and self.start is not None:
+            lost_raw = self.start
+        else:
+            lost_raw = (base.exact(Fraction(lost or 0)) + _HALF).__floor__()
+        return Expected(
+            shape=Shape.FLAG,
+            length=1,
+            signed=base.signed,
+            factor=base.factor,
+            offset=base.offset,
+            minimum=None,
+            maximum=None,
+            not_available=lost_raw,
+            error=lost_raw,
+            codes=frozenset(),
+            quantity=base.quantity,
+            esc=base.esc,
+            scale=base.scale,
+            shift=base.shift,
+        )
+
+    def _numbers(self, names: Mapping[int, str]) -> dict[int, int]:
+        """Return the raw value of each number whose name is in the value table."""
+        found = {}
+        for number, name in names.items():
+            for raw, text in self.texts:
+                if text == normalize(name):
+                    found[number] = raw
+        return found
+
+
+def _exact(number: Any) -> Fraction:
+    """Return the decimal number that the file has."""
+    return Fraction(str(number))
+
+
+def _float_bits(number: Any, length: int) -> int:
+    packed = struct.pack("<f" if length == 32 else "<d", float(number))
+    return int.from_bytes(packed, "little")
+
+
+def _unit(signal: "Signal", settings: DbcConfig) -> str:
+    text = (signal.unit or "").strip()
+    return settings.units.get(text, text)
+
+
+def _conversion(source: str, target: str) -> tuple[Fraction, Fraction]:
+    """Return (m, b), so that ``value in target = value in source * m + b``."""
+    if units.says_nothing(target):
+        return Fraction(1), Fraction(0)
+    targets = units.shown(target)
+    for quantity, unit in units.shown(source or "1").items():
+        if quantity in targets:
+            scale, shift = size(quantity, unit)
+            target_scale, target_shift = size(quantity, targets[quantity])
+            return scale / target_scale, (shift - target_shift) / target_scale
+    raise KeyError(target)

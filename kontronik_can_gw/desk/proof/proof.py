@@ -1,0 +1,314 @@
+"""Proves each signal of a compiled DBC, or finds counter-examples."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.desk.proof import words
+from kontronik_can_gw.desk.proof.expected import (
+    Expected,
+    ExpectedMessage,
+    ExpectedSignal,
+    Shape,
+    expected_messages,
+)
+from kontronik_can_gw.desk.proof.formulas import Settings, Verdict, compare, received
+from kontronik_can_gw.desk.proof.planned import (
+    INT64_END,
+    Planned,
+    PlannedMessage,
+    PlannedSignal,
+    of_c,
+    of_python,
+    products,
+)
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.native.rows import NotInCore
+from kontronik_can_gw.native.tables import Tables
+from kontronik_can_gw.signals.packer import place
+from kontronik_can_gw.signals.plan import Layout, Piece
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+
+_FLOAT_END = 1 << 62
+"""The core in C divides smaller numbers for a float (core.c, quotient)."""
+
+
+@dataclass
+class Findings:
+    """The result of a proof. Each text begins with the message and the signal."""
+
+    proven: list[str] = field(default_factory=list)
+    """Signals that are proven completely."""
+    unproven: list[str] = field(default_factory=list)
+    """Signals about which nothing is known, with the reason."""
+    refuted: list[str] = field(default_factory=list)
+    """Counter-examples."""
+    refuted_signals: list[str] = field(default_factory=list)
+    """Signals with a counter-example."""
+    without_code: list[str] = field(default_factory=list)
+    """Proven signals whose code for "not available" is also a value."""
+    only_python: str = ""
+    """The reason why only the core in Python can send the layout, or ""."""
+
+
+class Proof:
+    """The proof of one layout.
+
+    Iterate over ``messages``. Afterwards ``findings`` is complete.
+    """
+
+    def __init__(
+        self,
+        database: "Database",
+        layout: Layout,
+        escs: Sequence[EscSettings],
+        settings: DbcConfig,
+    ) -> None:
+        self.findings = Findings()
+        self._layout = layout
+        self._escs = escs
+        self._expected = [*expected_messages(database, layout.file, escs, settings)]
+        self._tables: Tables | None = None
+        try:
+            self._tables = Tables(layout, escs, settings.silent_on_loss)
+        except NotInCore as error:
+            self.findings.only_python = str(error)
+
+    def messages(self) -> Iterator[str]:
+        """Prove one message after the other. Yields the name of each before it is proven."""
+        prover = Prover(self._escs)
+        plans = {plan.name: number for number, plan in enumerate(self._layout.messages)}
+        for expected in self._expected:
+            yield expected.name
+            number = plans.pop(expected.name, None)
+            if number is None:
+                self.findings.refuted.append(f"{expected.name}: is never sent")
+                continue
+            plan = self._layout.messages[number]
+            cores = [of_python(plan, self._escs)]
+            if self._tables is not None:
+                cores.append(of_c(plan, number, self._tables))
+            prover.prove(expected, cores, self.findings)
+        for name in plans:
+            self.findings.refuted.append(f"{name}: is sent, but is not in the DBC")
+
+    def complete(self) -> Findings:
+        """Prove all messages, and return the findings."""
+        for _ in self.messages():
+            pass
+        return self.findings
+
+
+class Prover:
+    """Compares messages with their plans. Equal problems are solved once."""
+
+    def __init__(self, escs: Sequence[EscSettings]) -> None:
+        self._escs = escs
+        self._solved: dict[object, Verdict] = {}
+
+    def prove(
+        self, expected: ExpectedMessage, plans: Sequence[PlannedMessage], findings: Findings
+    ) -> None:
+        """Add the results of one message. ``plans`` has the plan of each core that can send it."""
+        wrong = [
+            f"{expected.name}: {problem}"
+            for plan in plans
+            for problem in _frame_problems(expected, plan)
+        ]
+        findings.refuted += dict.fromkeys(wrong)
+        by_name: dict[str, list[ExpectedSignal]] = {}
+        for signal in expected.signals:
+            by_name.setdefault(signal.name, []).append(signal)
+        for name, signals in by_name.items():
+            self._prove_signal(f"{expected.name}.{name}", signals, plans, findings)
+
+    def _prove_signal(
+        self,
+        where: str,
+        pages: Sequence[ExpectedSignal],
+        plans: Sequence[PlannedMessage],
+        findings: Findings,
+    ) -> None:
+        """Add the result of a signal on all of its pages, for each core."""
+        refuted: list[str] = []
+        reasons: list[str] = []
+        for signal in pages:
+            if signal.rule is None:
+                reasons.append(signal.reason)
+                continue
+            for plan in plans:
+                refuted += self._counter_examples(signal, signal.rule, plan, reasons)
+            refuted += _shared_codes(signal, signal.rule)
+        if refuted:
+            findings.refuted += [f"{where}: {text}" for text in dict.fromkeys(refuted)]
+            findings.refuted_signals.append(where)
+        elif reasons:
+            findings.unproven.append(f"{where}: {reasons[0]}")
+        else:
+            findings.proven.append(where)
+            if any(signal.rule is not None and _lacks_code(signal.rule) for signal in pages):
+                findings.without_code.append(where)
+
+    def _counter_examples(
+        self, signal: ExpectedSignal, rule: Expected, plan: PlannedMessage, reasons: list[str]
+    ) -> Iterator[str]:
+        """Yield counter-examples of one plan. Adds a line to ``reasons`` if nothing is known."""
+        if rule.shape is Shape.CONSTANT:
+            yield from _wrong_constant(signal, rule, plan)
+            return
+        if rule.shape is Shape.CRC:
+            yield from _wrong_crc(signal, plan)
+            reasons.append("a CRC: only its place and its data id are compared")
+            return
+        found = [each for each in plan.signals if _is_on(each, signal)]
+        if len(found) != 1:
+            yield f"is sent {len(found)} times in a frame"
+            return
+        (planned,) = found
+        yield from _wrong_bits(signal, rule, planned.pieces)
+        if rule.shape is Shape.ALIVE:
+            if planned.planned is not None or planned.modulus != rule.modulus:
+                yield f"counts {planned.modulus} frames before it restarts, not {rule.modulus}"
+            return
+        if planned.planned is None:
+            yield "is sent as a counter of frames"
+            return
+        overflow = _overflow(signal, planned.planned)
+        if overflow is not None:
+            yield overflow
+            return
+        if rule.shape is Shape.FLOAT:
+            reasons.append("a float")
+            return
+        if planned.planned.is_float:
+            yield "is sent as a float"
+            return
+        verdict = self._verdict(rule, planned.planned)
+        if verdict.counter_example is not None:
+            yield words.counter_example(signal, verdict.counter_example)
+        elif verdict.reason:
+            reasons.append(verdict.reason)
+
+    def _verdict(self, rule: Expected, plan: Planned) -> Verdict:
+        """Return the verdict about a plan. Copies for other ESCs have the same."""
+        esc = self._escs[rule.esc or 0]
+        settings = Settings(esc.pole_pairs, esc.gear, esc.cell_count or 1)
+        normal = replace(plan, esc=None if plan.esc == rule.esc else -1)
+        rule = replace(rule, esc=None)
+        key = (repr(rule), repr(normal), settings)
+        if key not in self._solved:
+            self._solved[key] = compare(rule, normal, settings)
+        return self._solved[key]
+
+
+def _is_on(planned: PlannedSignal, signal: ExpectedSignal) -> bool:
+    return planned.name == signal.name and planned.page == signal.page
+
+
+def _lacks_code(rule: Expected) -> bool:
+    """Return True if the code for "not available" may also be sent for a value."""
+    if rule.quantity is None or rule.has_code or rule.shape is Shape.COUNTER:
+        return False
+    if rule.shape is Shape.FLAG:
+        return True
+    if rule.shape is Shape.NAMES:
+        return rule.not_available in rule.numbers.values()
+    return replace(rule, codes=frozenset()).is_value(rule.not_available)
+
+
+def _shared_codes(signal: ExpectedSignal, rule: Expected) -> Iterator[str]:
+    """Yield the counter values that are codes of the value table."""
+    if rule.shape in (Shape.ALIVE, Shape.COUNTER):
+        for code in sorted(code for code in rule.codes if 0 <= code < rule.modulus):
+            name = signal.source.replace("_", " ") or "the counter"
+            yield f"{name} {code} is sent as {words.sent(signal, code)}"
+
+
+def _frame_problems(expected: ExpectedMessage, plan: PlannedMessage) -> Iterator[str]:
+    """Yield the differences in id, length and constant bits."""
+    if (plan.can_id, plan.extended) != (expected.can_id, expected.extended):
+        yield f"is sent with id {plan.can_id:X}h, not {expected.can_id:X}h"
+    if plan.length != expected.length:
+        yield f"is sent with {plan.length} bytes, not {expected.length}"
+    if plan.data_id not in (None, expected.data_id & 0xFFFF):
+        yield f"its CRC has the data id {plan.data_id:X}h, not {expected.data_id & 0xFFFF:X}h"
+    known = {(signal.name, signal.page) for signal in expected.signals}
+    for signal in plan.signals:
+        if (signal.name, signal.page) not in known:
+            yield f"{signal.name} is sent on page {signal.page}, where the DBC has no such signal"
+    if tuple(plan.constants) != expected.pages:
+        yield f"is sent with the pages {[*plan.constants]}, not {[*expected.pages]}"
+    for page, bits in plan.constants.items():
+        if expected.multiplexer:
+            number = _read(expected.multiplexer, bits)
+            if number != (page or 0):
+                yield f"page {page} is sent as page {number}"
+        own = set(expected.multiplexer)
+        for each in expected.signals:
+            is_constant = each.rule is not None and each.rule.shape is Shape.CONSTANT
+            if is_constant and each.page in (None, page):
+                own |= set(each.bits)
+        for bit in range(bits.bit_length()):
+            if bits >> bit & 1 and bit not in own:
+                yield f"bit {bit % 8} of byte {bit // 8} is always 1, but no constant is there"
+
+
+def _wrong_constant(signal: ExpectedSignal, rule: Expected, plan: PlannedMessage) -> Iterator[str]:
+    for page, bits in plan.constants.items():
+        if signal.page not in (None, page):
+            continue
+        raw = received(rule, _read(signal.bits, bits))
+        if raw != received(rule, rule.constant):
+            want = words.sent(signal, received(rule, rule.constant))
+            yield f"its constant is sent as {words.sent(signal, raw)}, not as {want}"
+
+
+def _wrong_crc(signal: ExpectedSignal, plan: PlannedMessage) -> Iterator[str]:
+    if plan.data_id is None:
+        yield "the message is sent without its CRC"
+    elif signal.bits != tuple(range(8 * plan.crc_at, 8 * plan.crc_at + 8)):
+        yield f"its CRC is sent in byte {plan.crc_at}"
+
+
+def _read(bits: Sequence[int], frame: int) -> int:
+    """Return the unsigned number in these bits of a frame, least significant first."""
+    return sum((frame >> at & 1) << number for number, at in enumerate(bits))
+
+
+def _wrong_bits(signal: ExpectedSignal, rule: Expected, pieces: Sequence[Piece]) -> Iterator[str]:
+    """Yield the first bit of the raw value that is not sent at its place.
+
+    Each bit is placed by itself, so the places of all bits follow from the places of each.
+    """
+    for number, at in enumerate(signal.bits):
+        raw = received(rule, 1 << number)
+        frame = place(pieces, 1 << number)
+        if frame == 1 << at:
+            continue
+        read = received(rule, _read(signal.bits, frame))
+        if read != raw and rule.shape is not Shape.FLOAT:
+            got = words.decimal(rule.physical(read))
+            value = words.decimal(rule.physical(raw))
+            yield f"{signal.source or 'the value'} {value} is sent as {got}".replace("_", " ")
+        else:
+            yield f"bit {number} of its raw value is not sent at bit {at % 8} of byte {at // 8}"
+        return
+
+
+def _overflow(signal: ExpectedSignal, plan: Planned) -> str | None:
+    """Return the first product that leaves the 64 bits of the core in C. None if there is none."""
+    rule = signal.rule
+    assert rule is not None
+    assert rule.quantity is not None
+    limit = _FLOAT_END if plan.is_float else INT64_END
+    most = max(abs(rule.quantity.low), abs(rule.quantity.high))
+    for name, largest in products(plan, most):
+        if largest >= limit:
+            steps = words.decimal(Fraction(most, rule.quantity.steps))
+            value = f"{signal.source.replace('_', ' ')} {steps} {rule.quantity.unit}".rstrip()
+            return f"{value}: {name} is up to {largest}, which leaves {limit.bit_length()} bits"
+    return None

@@ -1,0 +1,160 @@
+"""The DBCs of this project are proven by ``check --prove``, and faults of the compiler refuted."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import run, written
+from put_in_faults import Fault
+
+PROJECT = Path(__file__).resolve().parents[2]
+EXAMPLES = sorted((PROJECT / "examples").glob("*/gateway.toml"))
+ONE_ESC = '[[esc]]\nport = "/dev/ttyUSB0"\npole_pairs = 7\n'
+EVERY_RULE = f"""
+[can]
+fd = true
+[[esc]]
+name = "left"
+port = "/dev/ttyUSB0"
+pole_pairs = 7
+gear = "5/2"
+[[esc]]
+name = "right"
+port = "/dev/ttyUSB1"
+pole_pairs = 3
+[dbc]
+file = "{Path(__file__).with_name("every_rule.dbc")}"
+unbound = "start_value"
+"""
+"""A DBC with each kind of signal, and two ESCs."""
+LIST = PROJECT / "tests/mutants/plan_faults.toml"
+LIMIT_S = 300
+
+
+def configuration(folder: Path, dbc: str = "") -> Path:
+    """Write a configuration with one of the DBCs of this folder."""
+    text = EVERY_RULE
+    if dbc:
+        text = text.replace("every_rule.dbc", dbc)
+    return written(folder / "gateway.toml", text)
+
+
+def proof_of(path: Path) -> dict[str, Any]:
+    """Return the part of ``check --prove --json`` about the proof."""
+    done = run("check", "--prove", "--json", path)
+    assert done.err == ""
+    found: dict[str, Any] = json.loads(done.out)["proof"]
+    assert done.code == int(bool(found["refuted"]))
+    return found
+
+
+def test_the_shipped_dbc_is_proven_completely(tmp_path: Path) -> None:
+    found = proof_of(written(tmp_path / "gateway.toml", ONE_ESC))
+    assert found["refuted"] == []
+    assert found["unproven"] == []
+    assert len(found["proven"]) > 100
+    assert found["only_python"] == ""
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.parent.name)
+def test_the_dbc_of_each_example_is_proven_completely(path: Path) -> None:
+    found = proof_of(path)
+    assert found["refuted"] == []
+    assert found["unproven"] == []
+    assert found["proven"]
+
+
+def test_there_are_four_examples() -> None:
+    assert len(EXAMPLES) == 4
+
+
+def test_a_dbc_with_each_kind_of_signal_is_proven_completely(tmp_path: Path) -> None:
+    found = proof_of(configuration(tmp_path))
+    assert found["refuted"] == []
+    assert found["unproven"] == []
+    assert found["only_python"] == ""
+
+
+@pytest.mark.parametrize("name", ["my_car", "no_start_values", "kontronik_esc_0.5.0"])
+def test_a_dbc_of_the_golden_set_is_proven_except_floats_and_crcs(
+    tmp_path: Path, name: str
+) -> None:
+    file = PROJECT / f"tests/golden/inputs/{name}.dbc"
+    text = f'[can]\nfd = true\n{ONE_ESC}[dbc]\nfile = "{file}"\nunbound = "start_value"\n'
+    if name == "my_car":
+        text += 'node = "Gateway"\n'
+    found = proof_of(written(tmp_path / "gateway.toml", text))
+    assert found["refuted"] == []
+    assert found["proven"]
+    reasons = {line.partition(": ")[2] for line in found["unproven"]}
+    assert reasons <= {"a float", "a CRC: only its place and its data id are compared"}
+
+
+def test_a_layout_that_only_python_can_send_is_proven_for_python(tmp_path: Path) -> None:
+    path = configuration(tmp_path, "wide.dbc")
+    found = proof_of(path)
+    assert found["refuted"] == []
+    assert found["proven"] == ["LeftWide.LeftOutputSpeed", "RightWide.RightOutputSpeed"]
+    assert "leaves 64 bits" in found["only_python"]
+    assert "the core in Python, because" in run("check", "--prove", path).out
+
+
+# --- the proof can fail
+
+
+@dataclass(frozen=True)
+class PlanFault:
+    """A fault in the compiler of DBCs, and how the proof must refute it."""
+
+    fault: Fault
+    refuted_as: str
+    dbc: str
+
+
+def plan_faults() -> list[PlanFault]:
+    found = []
+    for each in tomllib.loads(LIST.read_text())["fault"]:
+        fault = Fault(each["what"], each["search"], each["replace"], ())
+        found.append(PlanFault(fault, each["refuted_as"], each.get("dbc", "")))
+    return found
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return a copy of the package, in which faults are put."""
+    folder = tmp_path_factory.mktemp("copy")
+    left_out = shutil.ignore_patterns("__pycache__", "*.so")
+    for name in ("kontronik_can_gw", "dbc", "eds"):
+        shutil.copytree(PROJECT / name, folder / name, ignore=left_out)
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("each", plan_faults(), ids=lambda each: each.fault.what)
+def test_a_fault_of_the_compiler_is_refuted(each: PlanFault, copy: Path, tmp_path: Path) -> None:
+    file, changed = each.fault.put_in(copy)
+    whole = file.read_text()
+    file.write_text(changed)
+    words = ["check", "--prove", "--json", str(configuration(tmp_path, each.dbc))]
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "kontronik_can_gw", *words],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
+            capture_output=True,
+            timeout=LIMIT_S,
+            check=False,
+        )
+    finally:
+        file.write_text(whole)
+    assert done.returncode == 1, done.stderr.decode()
+    refuted_lines = json.loads(done.stdout)["proof"]["refuted"]
+    assert any(each.refuted_as in line for line in refuted_lines), refuted_lines
