@@ -6,7 +6,8 @@ leaves out the refused messages with ``dbc.messages``, as the refusals advise.
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,7 @@ VALUES = {
     "power_stage_temperature": Fraction(33),
 }
 """The values of ``LIVE`` in their units."""
+ESCS = (EscSettings("esc1", 7),)
 
 
 def source_of(signal: Signal) -> str | None:
@@ -77,11 +79,10 @@ def by_unit(messages: Iterable[Message]) -> dict[str, str]:
     return found
 
 
-def prepared(database: Database, file: str, **settings: Any) -> tuple[Layout | None, list[str]]:
+def prepared(database: Database, file: str, settings: DbcConfig) -> tuple[Layout | None, list[str]]:
     """Return the layout of a gateway and no lines, or the lines of the refusal."""
-    escs = [EscSettings("esc1", 7)]
     try:
-        return prepare(database, file, escs, DbcConfig(**settings), True), []
+        return prepare(database, file, ESCS, settings, True), []
     except UserError as error:
         for line in error.problems:
             assert line.startswith((file, "dbc."))
@@ -90,7 +91,11 @@ def prepared(database: Database, file: str, **settings: Any) -> tuple[Layout | N
         return None, list(error.problems)
 
 
-def check_file(file: Path) -> None:
+def accepted(file: Path) -> Iterator[tuple[Database, Layout, DbcConfig]]:
+    """Yield database, layout and settings for each node of a DBC, if one of its messages is sent.
+
+    The assertions check the refusals.
+    """
     name = file.name
     try:
         database = load_database(file)
@@ -104,11 +109,10 @@ def check_file(file: Path) -> None:
     for message in database.messages:
         nodes |= set(message.senders)
     for node in sorted(nodes):
-        prepared(database, name, node=node)
+        prepared(database, name, DbcConfig(node=node))
         ours = [message for message in database.messages if node in message.senders]
-        bound = by_unit(ours)
-        settings = {"node": node, "unbound": "start_value"}
-        layout, refused = prepared(database, name, bind=bound, **settings)
+        settings = DbcConfig(node=node, unbound="start_value", bind=by_unit(ours))
+        layout, refused = prepared(database, name, settings)
         assert all("no such source" not in line for line in refused)
         if refused:
             places = [re.match(rf"{re.escape(name)}: (\w+)", line) for line in refused]
@@ -116,14 +120,19 @@ def check_file(file: Path) -> None:
             left = [message for message in ours if message.name not in bad]
             if not left:
                 continue
-            bound = by_unit(left)
             chosen = tuple(message.name for message in left)
-            layout, refused = prepared(database, name, bind=bound, messages=chosen, **settings)
+            settings = replace(settings, bind=by_unit(left), messages=chosen)
+            layout, refused = prepared(database, name, settings)
         assert layout is not None, refused
-        check_frames(database, layout, bound)
+        yield database, layout, settings
 
 
-def check_frames(database: Database, layout: Layout, bound: Mapping[str, str]) -> None:
+def check_file(file: Path) -> None:
+    for database, layout, settings in accepted(file):
+        check_frames(database, layout, settings.bind)
+
+
+def check_frames(database: Database, layout: Layout, bound: Mapping[str, str | float]) -> None:
     """Assert that each value is the nearest step, and that start values are as in the file.
 
     A value may be wrong only if it is outside the range of the signal.
@@ -154,10 +163,10 @@ def check_frames(database: Database, layout: Layout, bound: Mapping[str, str]) -
 def check_signal(
     signal: Signal,
     planned: SignalPlan,
-    source: str | None,
+    source: str | float | None,
     raw: Any,
 ) -> None:
-    if source is None:
+    if not isinstance(source, str):
         if planned.unbound and planned.not_available != planned.constant:
             assert raw == (signal.raw_initial or 0)
         return
