@@ -209,7 +209,7 @@ def test_only_its_own_tools_import_an_output() -> None:
     assert [name for name in sorted(importers) if not name.startswith(OUTPUT_TOOLS)] == []
 
 
-MAX_LINES = {"file": 450, "class": 300, "function": 50}
+MAX_LINES = {"file": 500, "class": 320, "function": 60}
 MAX_METHODS = 25
 
 

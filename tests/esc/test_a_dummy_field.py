@@ -20,7 +20,7 @@ from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.esc.kontronik.states import Device
-from kontronik_can_gw.esc.kontronik.codec import Layout
+from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.values import VALUES
@@ -34,7 +34,7 @@ gateway = Gateway(config.escs, assemble(config).layout, 0, outputs=[shipped_cano
 gateway.start(0)
 escs = []
 for device in (Device.KOSMIK, Device.JIVEPRO):
-    escs.append(SimulatedEsc(EscOptions(device=device, layout=Layout.V4), seed=device))
+    escs.append(SimulatedEsc(EscOptions(device=device, layout=WireLayout.V4), seed=device))
 frames = []
 for now in range(0, 3_000_000_000, 10_000_000):
     for index, esc in enumerate(escs):

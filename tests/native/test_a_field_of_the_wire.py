@@ -27,7 +27,7 @@ from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.esc.kontronik.codec import Layout, encode
+from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.export_c import exported
@@ -62,7 +62,7 @@ def stream(wire_layout):
 def frames(core):
     found = []
     now = 0
-    for wire_layout in (Layout.LEGACY, Layout.V4):
+    for wire_layout in (WireLayout.LEGACY, WireLayout.V4):
         for data in stream(wire_layout):
             core.receive(0, data, now, now)
             core.advance(now)
@@ -76,7 +76,7 @@ folder = Path("firmware")
 folder.mkdir()
 for name, text in exported(layout, escs, False, "licence").items():
     (folder / name).write_text(text)
-(folder / "uart.bin").write_bytes(b"".join(stream(Layout.V4)))
+(folder / "uart.bin").write_bytes(b"".join(stream(WireLayout.V4)))
 print(json.dumps({
     "why": made.why,
     "in Python": frames(PythonCore(escs, layout, 0, False)),
