@@ -227,6 +227,7 @@ case $what in
         install_clang
         install_cross_compilers
         install_other_machines
+        install_programs "a proof that the core has no undefined behaviour" frama-c=frama-c-base
         install_programs "Debian packages in fresh roots" debootstrap lintian
         ;;
     prove) install_compiler; install_project test '.[test]' ;;

@@ -90,7 +90,7 @@ STEPS = {
     "wheels": "python tests/native/wheels.py {scratch}",
     "machines": f"{PYTEST} -s tests/native/on_machines.py",
     "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} {FUZZ_OPTIONS} tests/native/test_fuzz.py",
-    "proofs": f"{PYTEST} -s {PROOF_OPTIONS} tests/proofs/long_proofs.py tests/proofs/real_dbcs.py",
+    "proofs": (f"{PYTEST} -s {PROOF_OPTIONS} tests/proofs/long_*.py tests/proofs/real_dbcs.py"),
     "deb": f"{PYTEST} -o faulthandler_timeout=900 tests/deb/in_fresh_roots.py",
 }
 TIERS = {
