@@ -63,8 +63,8 @@ def source_time() -> int:
         done = subprocess.run(command, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         sys.exit(
-            "make_deb.py: git cannot tell the time of the last commit: it is missing, or this is no "
-            "clone. Set it by hand: SOURCE_DATE_EPOCH=$(date +%s) make deb"
+            "make_deb.py: the time of the last commit is unknown, because git is missing or this is "
+            "not a clone. Set it by hand: SOURCE_DATE_EPOCH=$(date +%s) make deb"
         )
     return int(done.stdout)
 

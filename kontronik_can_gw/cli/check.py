@@ -130,7 +130,9 @@ def proof_lines(findings: "Findings", verbose: bool) -> Iterator[str]:
 def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     """Yield a summary of the gateway's inputs and outputs, in lines of at most 80 columns."""
     config = loaded.config
-    found = _counted(len(shown["warnings"]), "warning") if shown["warnings"] else "no warnings"
+    found = "no warnings"
+    if shown["warnings"]:
+        found = _counted(len(shown["warnings"]), "warning")
     yield f"{shown['file']}: can be used, {found}"
     for esc, settings in zip(config.esc, loaded.escs, strict=True):
         poles = _counted(settings.pole_pairs, "pole pair")

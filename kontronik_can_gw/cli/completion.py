@@ -32,10 +32,20 @@ examples:
 exit codes: 0 done; 1 the installed shtab does not know this shell, or the file
 cannot be written; 2 wrong usage
 """
-_KINDS = dict.fromkeys(("FILE", "SOURCE", "PATH", "IN", "OUT"), shtab.FILE) | {
-    "DIR": shtab.DIRECTORY
+_KINDS = {
+    "FILE": shtab.FILE,
+    "SOURCE": shtab.FILE,
+    "PATH": shtab.FILE,
+    "IN": shtab.FILE,
+    "OUT": shtab.FILE,
+    "DIR": shtab.DIRECTORY,
 }
-_ENDINGS = {"config": ("*.toml",), "dbc": ("*.dbc", "*.DBC"), "from": ("*.dbc", "*.DBC")}
+"""Completions of options and arguments, by the name of their value."""
+_ENDINGS = {
+    "config": ("*.toml",),
+    "dbc": ("*.dbc", "*.DBC"),
+    "from": ("*.dbc", "*.DBC"),
+}
 """Endings of file names for options, by the attribute name of the option."""
 
 
@@ -54,7 +64,8 @@ def main(args: argparse.Namespace) -> int:
             complete = shtab.glob(*endings)
         if complete is not None:
             action.complete = complete  # type: ignore[attr-defined]
-    write_output(args.output, shtab.complete(parser, args.shell) + "\n", force=args.force)
+    script = shtab.complete(parser, args.shell)
+    write_output(args.output, script + "\n", force=args.force)
     return 0
 
 

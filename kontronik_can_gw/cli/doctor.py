@@ -84,7 +84,9 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
         _outputs(about, assemble(config))
     except UserError as error:
         code = error.exit_code
-        command = "" if config is None else f"kontronik-can-gw check -c {path}"
+        command = ""
+        if config is not None:
+            command = f"kontronik-can-gw check -c {path}"
         for problem in error.problems:
             about.add("config", "mistake", problem=problem, command=command)
     if config is not None:

@@ -36,7 +36,17 @@ EPILOG = (
     "Exit codes: 0 done; 1 the file cannot be written; 2 wrong usage, configuration or EDS."
 )
 _STATES_AND_COMMANDS = frozenset(
-    {0x1001, 0x1002, 0x1003, 0x1010, 0x1011, VERIFY, at.INFO, at.RESET_STATISTICS, at.ERROR_CODE}
+    {
+        0x1001,
+        0x1002,
+        0x1003,
+        0x1010,
+        0x1011,
+        VERIFY,
+        at.INFO,
+        at.RESET_STATISTICS,
+        at.ERROR_CODE,
+    }
 )
 """Objects that show a state, or have an effect when they are written."""
 
@@ -66,7 +76,8 @@ def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, name: str) 
             if name == "-" or not is_valid:
                 name = f"{Path(setup.eds.name).stem}_{node_id}.dcf"
             bitrate = node.settings.bitrate
-            return dcf(setup.eds, node_id, bitrate, _active_values(node), esc.name, name)
+            values = _active_values(node)
+            return dcf(setup.eds, node_id, bitrate, values, esc.name, name)
     there = [str(node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
     known = f"Available: {', '.join(there)}" if there else "All nodes wait for LSS"
     raise UserError(f"--node-id {node_id}: not in the configuration. {known}.")
@@ -79,8 +90,10 @@ def _active_values(node: Node) -> dict[tuple[int, int], Value]:
     """
     values: dict[tuple[int, int], Value] = {}
     for variable in node.dictionary.variables.values():
-        key = (variable.entry.index, variable.entry.sub)
-        if not variable.readable or key in BINDINGS or variable.entry.index in _STATES_AND_COMMANDS:
+        entry = variable.entry
+        key = (entry.index, entry.sub)
+        is_configuration = key not in BINDINGS and entry.index not in _STATES_AND_COMMANDS
+        if not variable.readable or not is_configuration:
             continue
         try:
             values[key] = node.dictionary.value(variable, 0)

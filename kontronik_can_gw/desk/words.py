@@ -11,9 +11,12 @@ def clock(time_ns: int) -> str:
     seconds, tenth = divmod(abs(tenths), 10)
     minutes, seconds = divmod(seconds, 60)
     hours, minutes = divmod(minutes, 60)
-    text = f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
-    sign = "−" if tenths < 0 else ""
-    return f"{sign}{text}.{tenth}"
+    text = f"{minutes}:{seconds:02}"
+    if hours:
+        text = f"{hours}:{minutes:02}:{seconds:02}"
+    if tenths < 0:
+        text = f"−{text}"
+    return f"{text}.{tenth}"
 
 
 def duration(length_ns: int) -> str:

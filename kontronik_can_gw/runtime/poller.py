@@ -114,20 +114,24 @@ class Poller:
 
     def watched(self) -> list[tuple[int, int, int | None]]:
         """Return the watched descriptors, with their events and the number of their ESC."""
-        return [
-            (fd, events, esc)
-            for fd, (_, events, esc) in self._watched.items()
-            if fd not in self._closed
-        ]
+        found = []
+        for fd, (_, events, esc) in self._watched.items():
+            if fd not in self._closed:
+                found.append((fd, events, esc))
+        return found
 
     def _events(self, fd: int, bits: int) -> int:
         if bits & select.POLLNVAL:
             self._poll.unregister(fd)
             self._closed.add(fd)
             self.changes += 1
-        readable = select.POLLIN if bits & ~select.POLLOUT else 0
-        writable = select.POLLOUT if bits & ~select.POLLIN else 0
-        return self._watched[fd][1] & (readable | writable)
+        events = 0
+        if bits & ~select.POLLOUT:
+            events |= select.POLLIN
+        if bits & ~select.POLLIN:
+            events |= select.POLLOUT
+        _, watched, _ = self._watched[fd]
+        return events & watched
 
     def close(self) -> None:
         self._watched.clear()

@@ -510,7 +510,9 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
         bench.turn(3000)
         assert not bench.can.is_open
     else:
-        with pytest.raises(RunError, match="is the port of left, and nothing may be sent to an ESC"):
+        with pytest.raises(
+            RunError, match="is the port of left, and nothing may be sent to an ESC"
+        ):
             bench.can.open(bench.now, wait=False)
     assert opened == []
 

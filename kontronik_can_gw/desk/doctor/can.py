@@ -48,11 +48,12 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
         for name in machine.names(net):
             if machine.text(f"{net}/{name}/type") == _CAN_TYPE:
                 there.append(name)
-        case = "no_can"
-        if not machine.exists(folder):
+        if machine.exists(folder):
+            case = "no_can"
+        elif kind_by_name(can.channel) in VIRTUAL:
+            case = "no_virtual"
+        else:
             case = "others" if there else "none"
-            if kind_by_name(can.channel) in VIRTUAL:
-                case = "no_virtual"
         findings.add("can.exists", case, there=", ".join(there) or "none")
         return findings.found
     link = _link(machine, can.channel)
@@ -64,7 +65,8 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
     flags = int(machine.text(f"{folder}/flags") or "0", 0)
     is_up = bool(flags & 1)
     findings.add("can.up", "ok" if is_up else "down")
-    if can.fd and int(machine.text(f"{folder}/mtu") or "0") < _FD_MTU:
+    mtu = int(machine.text(f"{folder}/mtu") or "0")
+    if can.fd and mtu < _FD_MTU:
         findings.add("can.fd", "off")
     if not link:
         findings.add("can.details", "no_ip")
@@ -102,9 +104,10 @@ def _controller(
         rates["data_bitrate"] = (can.data_bitrate, data_bitrate)
     if is_up or bitrate:  # otherwise the command that starts it sets all of it
         for key, (wanted, real) in rates.items():
-            case = "other" if real else "none"
             if real == wanted:
                 case = "ok"
+            else:
+                case = "other" if real else "none"
             findings.add("can.bitrate", case, key=key, wanted=wanted, real=real)
         ms = data.get("restart_ms", 0)
         case = "slcan"

@@ -150,7 +150,8 @@ class CaptureInput(PlayedInput):
         yield replay.finish()
         if replay.lost:
             self.damage.append(
-                f"{replay.lost} entries could not be recorded, because the disk was too slow or full"
+                f"{replay.lost} entries could not be recorded, "
+                "because the disk was too slow or full"
             )
         if replay.rejected:
             self.damage.append(f"{replay.rejected} entries cannot be interpreted by this version")
@@ -333,7 +334,8 @@ class CaptureInput(PlayedInput):
     def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
         if header.get("run") != self.header.get("run"):
             raise UserError(
-                f"{path}: is part of another run than {self._paths[0]}. Convert each run separately."
+                f"{path}: is part of another run than {self._paths[0]}. "
+                "Convert each run separately."
             )
         clock = _clock_of(header)
         if clock is not None:

@@ -55,7 +55,9 @@ class LogFrame(NamedTuple):
         """The type of the frame, for counts that people read."""
         if self.frame.can_id & ERROR:
             return "error frame"
-        return "remote frame" if self.frame.remote else "CAN frame"
+        if self.frame.remote:
+            return "remote frame"
+        return "CAN frame"
 
 
 class ClockStep(NamedTuple):
@@ -279,12 +281,16 @@ class Input(ABC):
     def wall_offset_ns(self, time_ns: int) -> int | None:
         """Return Unix time minus the recording's time at ``time_ns``. None if it is unknown."""
         wall_ns = self.wall_ns(time_ns)
-        return None if wall_ns is None else wall_ns - time_ns
+        if wall_ns is None:
+            return None
+        return wall_ns - time_ns
 
 
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun: "1 row", "2 rows"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+    if count == 1:
+        return f"{count} {noun}"
+    return f"{count} {noun}s"
 
 
 def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:
@@ -295,13 +301,15 @@ def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:
         listed = []
         for step in hidden:
             direction = "back" if step.by_ns < 0 else "ahead"
-            listed.append(f"{direction} {_by_and_after(step, step.time_ns - begin_ns)}")
+            elapsed_ns = step.time_ns - begin_ns
+            listed.append(f"{direction} {_by_and_after(step, elapsed_ns)}")
         notes.append(f"the clock was set {_some_of(listed)}; times continue without the step")
     if kept:
         listed = []
         for step in kept:
             before_ns = step.time_ns - step.by_ns  # the time after the jump contains the jump
-            listed.append(_by_and_after(step, before_ns - begin_ns))
+            elapsed_ns = before_ns - begin_ns
+            listed.append(_by_and_after(step, elapsed_ns))
         notes.append(
             f"times jump ahead {_some_of(listed)}: a pause, or the clock was set; the jump is kept"
         )

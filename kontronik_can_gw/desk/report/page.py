@@ -245,8 +245,8 @@ def _notes(flight: Flight) -> str:
     if flight.points.rows_in_bucket > 1:
         lines.append(
             "Lines are drawn from the minimum and the maximum of each "
-            f"{flight.points.rows_in_bucket} rows. No peak is lost, and its time is exact to within "
-            "these rows. All numbers in the tables are computed from every row."
+            f"{flight.points.rows_in_bucket} rows. No peak is lost, and its time is exact to "
+            "within these rows. All numbers in the tables are computed from every row."
         )
     if any("battery_power" in esc.computed for esc in flight.escs):
         lines.append(

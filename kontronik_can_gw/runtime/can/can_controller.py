@@ -138,8 +138,8 @@ class CanController:
             self.ask(now)
         elif port.state is CanState.ERROR_PASSIVE:
             text = (
-                f"{name}: error-passive. The bit rate is wrong, a cable or the termination is faulty, "
-                "or no other node acknowledges."
+                f"{name}: error-passive. The bit rate is wrong, a cable or the termination is "
+                "faulty, or no other node acknowledges."
             )
             self._conditions.begin(self.condition, text, now)
         elif port.state is not CanState.UNKNOWN:

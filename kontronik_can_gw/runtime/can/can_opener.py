@@ -58,8 +58,8 @@ class CanOpener:
         esc = self._esc_at(config.channel)
         if esc is not None:
             raise RunError(
-                f"can.channel: {config.channel} is the port of {esc}, and nothing may be sent to an "
-                "ESC. Name a CAN interface."
+                f"can.channel: {config.channel} is the port of {esc}, and nothing may be sent to "
+                "an ESC. Name a CAN interface."
             )
         if self._is_at_once:
             try:

@@ -44,7 +44,13 @@ _RESTART_MS = 6
 _ERROR_COUNTERS = 8
 _TYPE_MASK = 0x3FFF
 _BUFFER = 1 << 16
-_STATES = (CanState.ERROR_ACTIVE, CanState.ERROR_WARNING, CanState.ERROR_PASSIVE, CanState.BUS_OFF)
+_STATES = (
+    CanState.ERROR_ACTIVE,
+    CanState.ERROR_WARNING,
+    CanState.ERROR_PASSIVE,
+    CanState.BUS_OFF,
+)
+"""States of the controller by their number in the kernel."""
 
 
 class LinkFacts(NamedTuple):
@@ -76,9 +82,11 @@ class LinkMonitor:
 
     def __init__(self, name: str) -> None:
         self._name = name.encode()
-        body = _INTERFACE.pack(0, 0, 0, 0, 0) + _attribute(_NAME, self._name + b"\0")
+        body = _INTERFACE.pack(0, 0, 0, 0, 0)
+        body += _attribute(_NAME, self._name + b"\0")
         body += _attribute(_EXT_MASK, _WITHOUT_STATISTICS)
-        self._question = _HEADER.pack(_HEADER.size + len(body), _GET_LINK, _REQUEST, 0, 0) + body
+        size = _HEADER.size + len(body)
+        self._question = _HEADER.pack(size, _GET_LINK, _REQUEST, 0, 0) + body
         self._heard: tuple[bytes, list[LinkFacts]] = b"", []
         """The last datagram and its reports, because most answers are identical."""
         kind = socket.SOCK_RAW | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC
@@ -110,10 +118,15 @@ class LinkMonitor:
                     return found
                 self.ask()  # reports were lost, so the present state is needed
                 continue
-            if data != self._heard[0]:
-                facts = [self._facts(kind, body) for kind, body in _messages(data)]
-                self._heard = (data, [each for each in facts if each is not None])
-            found += self._heard[1]
+            last_data, reports = self._heard
+            if data != last_data:
+                reports = []
+                for kind, body in _messages(data):
+                    facts = self._facts(kind, body)
+                    if facts is not None:
+                        reports.append(facts)
+                self._heard = (data, reports)
+            found += reports
 
     def close(self) -> None:
         self._socket.close()
@@ -176,7 +189,9 @@ def _counters(value: bytes | None) -> tuple[int, int] | None:
 
 
 def _attribute(kind: int, value: bytes) -> bytes:
-    return _ATTRIBUTE.pack(_ATTRIBUTE.size + len(value), kind) + value + bytes(-len(value) % 4)
+    head = _ATTRIBUTE.pack(_ATTRIBUTE.size + len(value), kind)
+    padding = bytes(-len(value) % 4)
+    return head + value + padding
 
 
 def _messages(data: bytes) -> Iterator[tuple[int, bytes]]:

@@ -53,10 +53,11 @@ class ParameterSaver:
     def _take(self, index: int, error: str | None, now: int) -> None:
         name = self._escs[index].name
         if error is None:
+            self._last_error = ""
             log.info("%s: parameters stored", name)
         else:
+            self._last_error = f"{name}: {error}"
             log.error("%s: parameters cannot be stored: %s", name, error)
-        self._last_error = "" if error is None else f"{name}: {error}"
         self._gateway.saved(index, error, now)
 
     def facts(self) -> StoreFacts | None:

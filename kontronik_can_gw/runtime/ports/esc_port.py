@@ -132,8 +132,8 @@ class EscPort:
             self._conditions.log(logging.INFO, text)
         if self._protocol.even_parity and is_mini_uart(port.path):
             text = (
-                f"{self.name}: {port.path} is a Raspberry Pi's mini-UART, which does not support even "
-                "parity. Some or all frames may be lost. Use ttyAMA0."
+                f"{self.name}: {port.path} is a Raspberry Pi's mini-UART, which does not support "
+                "even parity. Some or all frames may be lost. Use ttyAMA0."
             )
             self._conditions.log(logging.WARNING, text)
 
@@ -367,7 +367,10 @@ class EscLog:
 
 
 def _describe(line_errors: Mapping[str, int]) -> str:
-    counts = [
-        f"{count} {kind} errors" for kind, count in line_errors.items() if count and kind != "break"
-    ]
-    return f" (the driver counts {', '.join(counts)})" if counts else ""
+    counts = []
+    for kind, count in line_errors.items():
+        if count and kind != "break":
+            counts.append(f"{count} {kind} errors")
+    if not counts:
+        return ""
+    return f" (the driver counts {', '.join(counts)})"

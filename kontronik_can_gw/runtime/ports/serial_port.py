@@ -36,7 +36,13 @@ _TERMIOS_SIZE = 64
 """Bytes that suffice for the kernel's struct termios on every machine."""
 _COUNTS = struct.Struct("=20i")
 _WAITING = struct.Struct("=i")
-_LINE_ERRORS = {"framing": 6, "overrun": 7, "parity": 8, "break": 9, "buffer_overrun": 10}
+_LINE_ERRORS = {
+    "framing": 6,
+    "overrun": 7,
+    "parity": 8,
+    "break": 9,
+    "buffer_overrun": 10,
+}
 """Positions of the counters in struct serial_icounter_struct (linux/serial.h)."""
 
 
@@ -174,9 +180,10 @@ def line_errors(fd: int) -> dict[str, int]:
     Empty if the driver counts none.
     """
     try:
-        counts = _COUNTS.unpack(fcntl.ioctl(fd, _TIOCGICOUNT, bytes(_COUNTS.size)))
+        answer = fcntl.ioctl(fd, _TIOCGICOUNT, bytes(_COUNTS.size))
     except OSError:
         return {}
+    counts = _COUNTS.unpack(answer)
     return {kind: counts[place] for kind, place in _LINE_ERRORS.items()}
 
 
@@ -192,7 +199,9 @@ def is_mini_uart(path: str, root: Path = Path("/")) -> bool:
 
 
 def _in_use(path: str, users: str) -> RunError:
-    who = f": {users}" if users else " (another gateway? a getty?)"
+    who = " (another gateway? a getty?)"
+    if users:
+        who = f": {users}"
     name = Path(os.path.realpath(path)).name
     getty = ""
     if name.startswith("tty"):
@@ -332,14 +341,16 @@ def _users(path: str) -> str:
             found.add(
                 f"the kernel's console (remove console={name} from the kernel's command line)"
             )
+    own = str(os.getpid())
     seen = [process for process in _seen_users if _has_open(process, device)]
     # All programs are searched only if the earlier users have closed the port.
     for process in seen or Path("/proc").glob("[0-9]*"):
-        if process.name != str(os.getpid()) and _has_open(process, device):
-            with contextlib.suppress(OSError):
-                name = (process / "comm").read_text(errors="replace").strip()
-                found.add(f"{name} (pid {process.name})")
-                _seen_users.add(process)
+        if process.name == own or not _has_open(process, device):
+            continue
+        with contextlib.suppress(OSError):
+            program = (process / "comm").read_text(errors="replace").strip()
+            found.add(f"{program} (pid {process.name})")
+            _seen_users.add(process)
     _seen_users.difference_update([process for process in _seen_users if not process.exists()])
     return ", ".join(sorted(found))
 

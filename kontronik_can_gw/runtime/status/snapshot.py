@@ -78,8 +78,13 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
     gateway = moment.gateway
     program = moment.program
     status = gateway.status
-    store = moment.store
     now = moment.now
+    escs = []
+    for esc, port in zip(gateway.escs, moment.ports, strict=True):
+        escs.append(_esc(esc, port, status, now))
+    nodes = []
+    for port, node in zip(moment.ports, gateway.nodes, strict=False):
+        nodes.append(_node(port.name, *node))
     document = {
         "format": FORMAT,
         "program": PROGRAM,
@@ -104,20 +109,24 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
             "core_reason": gateway.core_note or None,
         },
         "can": _can(moment.can, status),
-        "escs": [
-            _esc(esc, port, status, now)
-            for esc, port in zip(gateway.escs, moment.ports, strict=True)
-        ],
-        "nodes": [
-            _node(port.name, *node) for port, node in zip(moment.ports, gateway.nodes, strict=False)
-        ],
+        "escs": escs,
+        "nodes": nodes,
         "outputs": gateway.outputs,
-        "store": store and {"waiting": store.waiting, "last_error": store.last_error or None},
-        "recording": moment.recorder and vars(moment.recorder),
+        "store": _store(moment.store),
+        "recording": None if moment.recorder is None else vars(moment.recorder),
         "log": moment.log_lines[-LOG_LINES:],
         "rates": _rates(moment, before),
     }
     return f'{{"units":{_UNITS},{_encoded(document)[1:]}'
+
+
+def _store(store: StoreFacts | None) -> Document | None:
+    if store is None:
+        return None
+    return {
+        "waiting": store.waiting,
+        "last_error": store.last_error or None,
+    }
 
 
 def _node(esc: str, node_id: int, state: Enum, pdos_sent: int) -> Document:
@@ -180,9 +189,15 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
         live = None
     if esc.info_bound_ns is None or now - esc.info_bound_ns > INFO_TIMEOUT_NS:
         info = None
+    diagnosis = None
+    if live is None and port.open:
+        diagnosis = port.diagnosis
+    frame_rate_hz = None
+    if esc.frame_rate is not None:
+        frame_rate_hz = esc.frame_rate / 10
     protocol = esc.protocol
-    rate = esc.frame_rate
-    errors, warnings, statuses = _alarms(protocol, protocol.value("operating_errors", live))
+    word = protocol.value("operating_errors", live)
+    errors, warnings, statuses = _alarms(protocol, word)
     counters = esc.counters.as_dict()
     for name in _FURTHER_COUNTERS:
         counters[name] = getattr(esc, name)
@@ -195,14 +210,14 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
         "port": _port(port, now),
         "link": name_in_words(esc.link.name),
         "fresh": live is not None,
-        "diagnosis": port.diagnosis if live is None and port.open else None,
+        "diagnosis": diagnosis,
         "protocol": protocol.name,
         "layout": protocol.layout_text(esc.layout),
         "device": protocol.device_text(info),
         "variant": protocol.value("variant", info),
         "firmware": protocol.firmware_text(info),
         "peak_current_of": protocol.peak_current_text(info),
-        "frame_rate_hz": None if rate is None else rate / 10,
+        "frame_rate_hz": frame_rate_hz,
         "data_age_ms": esc.age_ms(now),
         "losses": esc.losses,
         "counters": counters,
@@ -216,12 +231,15 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
 
 
 def _port(port: PortFacts, now: int) -> Document:
+    lost_for_s = None
+    if port.lost_since_ns is not None:
+        lost_for_s = _seconds(now - port.lost_since_ns)
     return {
         "path": port.path,
         "open": port.open,
         "complaint": port.complaint or None,
         "reopened": max(0, port.reopened),
-        "lost_for_s": None if port.lost_since_ns is None else _seconds(now - port.lost_since_ns),
+        "lost_for_s": lost_for_s,
         "line_errors": port.line_errors,
     }
 

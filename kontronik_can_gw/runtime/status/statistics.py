@@ -110,7 +110,8 @@ class Statistics:
         self._locks = Locks()
         if self._locks.hold([_lock_name(file)]):
             raise RunError(
-                f"statistics.file {file}: another gateway writes it. Give each gateway its own file."
+                f"statistics.file {file}: another gateway writes it. "
+                "Give each gateway its own file."
             )
         self._worker: Worker[None] = Worker(
             "statistics", self._work, failed=self._fail, ended=self._end, capacity=1

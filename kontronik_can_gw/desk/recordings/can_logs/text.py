@@ -76,7 +76,9 @@ def frame_of(message: Any, first_channel: int = 0) -> LogFrame:
     time_ns = round(message.timestamp * SECOND)
     if abs(message.timestamp) >= _EXACT_S:
         time_ns = round(time_ns, -3)
-    channel = "1" if message.channel is None else str(message.channel + first_channel)
+    channel = "1"
+    if message.channel is not None:
+        channel = str(message.channel + first_channel)
     return checked(LogFrame(time_ns, frame, message.is_rx, channel))
 
 
@@ -196,7 +198,9 @@ def nanoseconds(text: bytes) -> int:
     if not fraction.isdigit() or len(fraction) > 9:
         raise ValueError
     found = int(seconds + fraction.ljust(9, b"0"))
-    return -found if is_negative else found
+    if is_negative:
+        return -found
+    return found
 
 
 # --- candump
@@ -363,8 +367,11 @@ class TrcReader(TextReader):
             return None
         columns = tuple(text.split(maxsplit=self._parser._num_columns))
         if self._is_error(columns):
-            time_ns = round(float(columns[self._columns["O"]]) * 1_000) * 1_000
-            channel = columns[self._columns["B"]] if "B" in self._columns else "1"
+            time_ms = float(columns[self._columns["O"]])
+            time_ns = round(time_ms * 1_000) * 1_000
+            channel = "1"
+            if "B" in self._columns:
+                channel = columns[self._columns["B"]]
             received = True if self._has_direction else None
             return checked(LogFrame(time_ns, error_frame(), received, channel))
         message = self._parser._parse_cols(columns)
@@ -373,8 +380,9 @@ class TrcReader(TextReader):
         if message.is_fd:  # other formats have the length instead of its code
             message.dlc = self._length_of_code(message.dlc)
         found = frame_of(message)
+        time_ns = round(found.time_ns, -3)
         received = found.received if self._has_direction else None
-        return found._replace(time_ns=round(found.time_ns, -3), received=received)
+        return found._replace(time_ns=time_ns, received=received)
 
     def _is_error(self, columns: Sequence[str]) -> bool:
         """Return True for the line of an error frame, which python-can does not read."""
