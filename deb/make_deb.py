@@ -63,7 +63,7 @@ def source_time() -> int:
         done = subprocess.run(command, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         sys.exit(
-            "make_deb.py: the time of the last commit is unknown, because git is missing or this is "
+            "make_deb.py: the time of the last commit is unknown: git is missing, or this is "
             "not a clone. Set it by hand: SOURCE_DATE_EPOCH=$(date +%s) make deb"
         )
     return int(done.stdout)
