@@ -1,5 +1,5 @@
-/* Runs the core's Thumb-2 code in Unicorn, counts its instructions, and searches for calls that need
-   more: the count is the objective of a hill climb over sequences of calls.
+/* Runs the core's Thumb-2 code in Unicorn, counts its instructions, and searches for calls that
+   need more: the count is the objective of a hill climb over sequences of calls.
 
    count_instructions IMAGE LIMITS CALLS SEED
 
@@ -62,7 +62,7 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     instructions += lengths[place];
 }
 
-/* Calls a function of the image. Arguments of 64 bits are in a pair of registers or on the stack. */
+/* Calls a function of the image. Arguments of 64 bits are in two registers or on the stack. */
 static uint32_t run(int function, const uint32_t *registers, const int64_t *on_stack, int stacked)
 {
     uint32_t sp = STACK - 64, lr = RETURN | 1, result = 0;

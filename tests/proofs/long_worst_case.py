@@ -15,7 +15,7 @@ FIRMWARE = Path(__file__).parents[2] / "docs" / "firmware.md"
 
 
 def test_no_call_needs_more_instructions_than_the_stated_worst_case(tmp_path: Path) -> None:
-    """The limit follows from the machine code and the limits of loops. The search has to stay below.
+    """The limit follows from the machine code and the limits of loops. The search stays below it.
 
     The limits in docs/firmware.md must not be lower.
     """

@@ -1,4 +1,4 @@
-"""What each signal of the shipped DBC must contain, from the vendor's sheet and the DBC's text alone.
+"""The right content of each signal of the shipped DBC, from the sheet and the DBC's text alone.
 
 Nothing here imports the gateway. The rows below are the tables of the sheet ("Telemetrieprotokoll",
 V4): offset, type and unit of each field, and the meaning of bits and numbers. The DBC is read with

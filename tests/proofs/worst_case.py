@@ -32,7 +32,7 @@ LONGEST = 44
 HELD = LONGEST - 1
 HEADER = 4
 LONGEST_CRCS = 40 + 34 + 4
-"""Passes of the CRC's loop for one header: both forms, the longer CRC, and the ends of the loops."""
+"""Passes of the CRC's loop for one header: both forms, the longer CRC, the ends of the loops."""
 
 
 def build_image(folder: Path) -> Path:
