@@ -16,6 +16,7 @@ from kontronik_can_gw.dbc.reader import listed
 from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable_json
+from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import UNCONFIGURED
 
 if TYPE_CHECKING:
@@ -153,6 +154,8 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
                 span += f" to {ids[-1]}"
         yield f"  DBC       {_counted(len(ids), 'message')}{span}, layout {shown['layout']}"
         yield f"            {shown['dbc']}"
+    for profile, names in _protected(loaded.layout).items():
+        yield f"  E2E       profile {profile}: {listed(names, 3)}"
     for output in loaded.outputs:
         for line in output.summary(loaded.escs):
             yield f"  {line}"
@@ -167,6 +170,15 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     if worst_frames > frames:
         condition = "if every value changes all the time"
         yield f"  at worst  {worst:.1%}, {worst_frames:.0f} frames/s: {condition}"
+
+
+def _protected(layout: Layout) -> dict[str, list[str]]:
+    """Return the names of the protected messages by their E2E profile."""
+    found: dict[str, list[str]] = {}
+    for message in layout.messages:
+        if message.e2e is not None:
+            found.setdefault(message.e2e.profile.name, []).append(message.name)
+    return found
 
 
 def details(loaded: Loaded) -> Iterator[str]:
@@ -225,6 +237,14 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
         "worst_frames_per_second": worst_frames,
         "dbc": layout.file,
         "layout": layout.fingerprint,
+        "e2e": {
+            message.name: {
+                "profile": message.e2e.profile.name,
+                "data_ids": list(message.e2e.data_ids),
+            }
+            for message in layout.messages
+            if message.e2e is not None
+        },
         "outputs": {each.name: lines for each in loaded.outputs if (lines := each.lines())},
         "canopen_nodes": node_ids,
     }

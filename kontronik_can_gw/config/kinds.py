@@ -88,6 +88,22 @@ def integer(low: int, high: int, also: int | None = None) -> KeyKind:
     return _plain(span, problem, **schema)
 
 
+def integer_or_list(low: int, high: int, length: int) -> KeyKind:
+    """Accept a whole number from ``low`` to ``high``, or a list of ``length`` such numbers."""
+    one = integer(low, high)
+
+    def check(value: Any) -> int | tuple[int, ...]:
+        if not isinstance(value, list):
+            number: int = one.check(value)
+            return number
+        if len(value) != length:
+            raise ValueError(f"{value!r} is not a list of {length} numbers")
+        return tuple(one.check(entry) for entry in value)
+
+    numbers = {"type": "array", "items": one.schema, "minItems": length, "maxItems": length}
+    return KeyKind(f"{one.span}, or lists of {length}", {"anyOf": [one.schema, numbers]}, check)
+
+
 def number(low: float, high: float) -> KeyKind:
     """Accept a number from ``low`` to ``high``."""
     problem = f"is outside {low}..{high}"

@@ -11,17 +11,20 @@ from kontronik_can_gw.config.kinds import (
     TEXT,
     choice,
     integer,
+    integer_or_list,
     key,
     meanings,
     table_of,
 )
 from kontronik_can_gw.signals import units
+from kontronik_can_gw.signals.e2e import DATA_IDS, PROFILES
 from kontronik_can_gw.signals.plan import SEND_TYPES
 from kontronik_can_gw.status import UNCONFIGURED
 
 SHIPPED = "shipped"
 NODE_ID = integer(1, 127, also=UNCONFIGURED)
 """Node-ID of a CANopen node."""
+_DATA_IDS = integer_or_list(0, 0xFFFF, DATA_IDS)
 _CAN_ID_MAX = 0x1FFFFFFF
 _UINT32_MAX = 0xFFFFFFFF
 
@@ -56,8 +59,12 @@ class DbcConfig:
     bind: Mapping[str, str | float] = key(BINDINGS, {},
         "'Signal' or 'Message.Signal' = its source, for example 'battery_voltage' or "
         "'left.battery_voltage', or a constant number")
-    e2e_data_ids: Mapping[str, int] = key(table_of(integer(0, 0xFFFF)), {},
-        "name of a message = its AUTOSAR E2E data id (default: the CAN id)")
+    e2e: Mapping[str, str] = key(table_of(choice(*PROFILES)), {},
+        "name of a message = its AUTOSAR E2E profile; '*' stands for any characters, and an exact name "
+        "has priority (default: the profile that the DBC's attributes state)")
+    e2e_data_ids: Mapping[str, int | Sequence[int]] = key(table_of(_DATA_IDS), {},
+        "name of a message = its AUTOSAR E2E data id, or a list of 16 for profiles 2 and 22 "
+        "(default: the DBC's attribute; profile 1A: the CAN id)")
     units: Mapping[str, str] = key(meanings(units.names()), {},
         "unit text in the DBC = the unit that is meant, "
         "for texts that the gateway does not recognise")

@@ -50,7 +50,7 @@ class Traits:
         self.follows_gateway = Group.GATEWAY in plan.paces and has_events
         roles = {signal.role: signal for signal in plan.compiled}
         alive = roles.get(Role.ALIVE)
-        self.alive_modulus = 0 if alive is None else alive_modulus(alive, Role.CRC in roles)
+        self.alive_modulus = 0 if alive is None else alive_modulus(alive, plan.e2e)
         self.triggers = Event.NONE
         if has_events:
             for pace in plan.paces:

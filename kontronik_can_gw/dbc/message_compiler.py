@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.copies import Copy
-from kontronik_can_gw.dbc.names import is_e2e
+from kontronik_can_gw.dbc.protection import message_protection, stated_protection
 from kontronik_can_gw.dbc.raw_values import raw_range
 from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.dbc.signal_compiler import Compilation, SignalCompiler
 from kontronik_can_gw.esc.value_names import normalize
+from kontronik_can_gw.signals.e2e import Protection
 from kontronik_can_gw.signals.plan import (
     FD_LENGTHS,
     SEND_TYPES,
@@ -49,10 +50,11 @@ def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
     if problem:
         job.problems.append(f"{where}: {problem}")
         return None
-    signals = _signals(job, copy)
+    stated = stated_protection(job, copy)
+    signals = _signals(job, copy, stated)
     job.problems += _placement_problems(message, where)
     job.problems += _page_problems(message, pages, signals, where)
-    job.problems += _crc_problems(job, copy, signals, where)
+    protection = message_protection(job, copy, signals, stated)
     if len(job.problems) > before:
         return None
     return MessagePlan(
@@ -68,7 +70,7 @@ def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
         escs=frozenset(s.esc for s in signals if s.esc is not None),
         paces=frozenset(s.source.pace or s.source.group for s in signals if s.source),
         pages=tuple(pages) or (None,),
-        data_id=job.settings.e2e_data_ids.get(copy.name, copy.frame_id & 0xFFFF),
+        e2e=protection,
     )
 
 
@@ -110,13 +112,13 @@ def _too_many_pages(message: "Message", count: int) -> str | None:
     return None
 
 
-def _signals(job: Compilation, copy: Copy) -> list[SignalPlan]:
+def _signals(job: Compilation, copy: Copy, protection: Protection | None) -> list[SignalPlan]:
     """Return the plans of a message's signals. A signal on several pages has one for each page."""
     plans = []
     for signal in copy.message.signals:
         if signal.length > copy.message.length * 8:
             continue  # reported by _placement_problems
-        compiler = SignalCompiler(job, copy, signal)
+        compiler = SignalCompiler(job, copy, signal, protection)
         for page in signal.multiplexer_ids or (None,):
             plan = compiler.plan(page)
             if plan is not None:
@@ -155,57 +157,6 @@ def _page_problems(
                 "but must be in every frame. "
                 f"Remove its m{signal.page}, or bind it to a constant."
             )
-
-
-def _crc_problems(
-    job: Compilation,
-    copy: Copy,
-    signals: Sequence[SignalPlan],
-    where: str,
-) -> Iterator[str]:
-    """Yield the problems of a checksum, and add a warning if its meaning is assumed.
-
-    A checksum is sent only as AUTOSAR E2E profile 1. It must be configured, or have one of the
-    well-known names.
-    """
-    crcs = [signal for signal in signals if signal.role is Role.CRC]
-    alive = [signal for signal in signals if signal.role is Role.ALIVE]
-    if len(crcs) > 1:
-        names = ", ".join(signal.name for signal in crcs)
-        yield f"{where}: has several CRC signals: {names}. Bind all but one to constants."
-    if len(crcs) != 1:
-        return
-    (crc,) = crcs
-    own = crc.name.removeprefix(copy.prefix)
-    is_bound = job.binder.bound(copy, own) is not None
-    is_configured = is_bound or copy.name in job.settings.e2e_data_ids
-    is_one_byte = len(crc.pieces) == 1 and crc.length == 8
-    fits = is_one_byte and crc.pieces[0].at % 8 == 0
-    has_counter = len(alive) == 1 and alive[0].high >= 14
-    has_known_names = False
-    if has_counter:
-        counter = alive[0].name.removeprefix(copy.prefix)
-        counter_source = str(job.binder.bound(copy, counter) or counter)
-        has_known_names = is_e2e(own, counter_source)
-    key = f"dbc.e2e_data_ids.{copy.name} = 0x{copy.frame_id & 0xFFFF:X}"
-    if not is_configured and not (fits and has_known_names):
-        yield (
-            f"{where}.{crc.name}: the DBC does not define how this checksum is computed. "
-            "For AUTOSAR E2E profile 1 (8 bits on a byte boundary, and exactly one alive counter "
-            f"from 0 to 14 in the message) set {key}. "
-            "Otherwise bind it to a constant, if receivers accept one, "
-            "or exclude the message with dbc.messages."
-        )
-        return
-    if not fits:
-        yield f"{where}.{crc.name}: an E2E profile 1 CRC needs 8 bits on a byte boundary."
-    if not has_counter:
-        problem = "E2E profile 1 needs exactly one alive counter, 0 to 14, in the message."
-        yield f"{where}: {crc.name}: {problem}"
-    if not is_configured:
-        job.warnings.append(
-            f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. To confirm this, set {key}"
-        )
 
 
 @cache

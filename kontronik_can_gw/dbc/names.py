@@ -65,6 +65,11 @@ def protection(name: str) -> Role | None:
     return Role.ALIVE if letters in _WHOLE else None
 
 
+def is_data_id(name: str) -> bool:
+    """Return True if a signal's name or binding means 4 bits of an E2E data id."""
+    return normalize(name).endswith(("dataid", "dataidnibble"))
+
+
 def is_e2e(crc: str, counter: str) -> bool:
     """Return True for a pair of names that means AUTOSAR E2E profile 1."""
     if not normalize(crc).endswith(_E2E_ENDINGS[Role.CRC]):

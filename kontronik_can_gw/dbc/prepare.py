@@ -26,7 +26,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import block_of
 from kontronik_can_gw.signals.packer import has_code
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
+from kontronik_can_gw.signals.plan import Layout, MessagePlan, SignalPlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -92,7 +92,6 @@ def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
                 name=copy.name,
                 can_id=copy.frame_id,
                 escs=frozenset((copy.esc,)),
-                data_id=job.settings.e2e_data_ids.get(copy.name, copy.frame_id & 0xFFFF),
                 renamed=(first.prefix, copy.prefix),
             )
             continue
@@ -100,8 +99,7 @@ def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
         if compiled is not None:
             yield compiled
             # a CRC must be configured with the name of each copy, so its copies may differ
-            is_protected = any(signal.role is Role.CRC for signal in compiled.compiled)
-            if compiled.escs == {copy.esc} and not is_protected:
+            if compiled.escs == {copy.esc} and compiled.e2e is None:
                 made[key] = (copy, compiled)
 
 
@@ -164,6 +162,9 @@ def _unused_settings(
     names = {copy.name for copy in ours}
     for name in sorted(set(settings.e2e_data_ids) - names):
         yield f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}."
+    for name in sorted(set(settings.e2e) - job.protected):
+        near = did_you_mean(name, [copy.name for copy in ours])
+        yield f"dbc.e2e.{name}: no message of {node} in {file} with this name has a CRC.{near}"
 
 
 def _unmet(

@@ -7,13 +7,14 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.dbc import names, raw_values
+from kontronik_can_gw.dbc import e2e_attributes, names, raw_values
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.dbc.raw_values import ValueTable, exact, raw_range
 from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.esc.values import Group, Value
 from kontronik_can_gw.signals import units
+from kontronik_can_gw.signals.e2e import DataIdMode, Protection
 from kontronik_can_gw.signals.packer import float_bits
 from kontronik_can_gw.signals.plan import Role, SignalPlan
 
@@ -42,15 +43,25 @@ class Compilation:
     """Texts of GenMsgSendType of the gateway's messages."""
     unbound: set[str] = field(default_factory=set)
     """Signals without a source."""
+    protected: set[str] = field(default_factory=set)
+    """Keys of [dbc.e2e] that apply to a message with a CRC."""
 
 
 class SignalCompiler:
     """Makes the plans of one signal. A signal has a plan for each of its pages."""
 
-    def __init__(self, job: Compilation, copy: Copy, signal: "Signal") -> None:
+    def __init__(
+        self,
+        job: Compilation,
+        copy: Copy,
+        signal: "Signal",
+        protection: Protection | None = None,
+    ) -> None:
         self.job = job
         self.copy = copy
         self.signal = signal
+        self.protection = protection
+        """The stated E2E protection of the signal's message."""
         self.table = ValueTable(signal)
         self.start = attribute(signal, "GenSigStartValue", job.database)
         self.start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
@@ -197,10 +208,16 @@ class SignalCompiler:
                 raise UnfitSignal(f"cannot represent its constant {bound} exactly.")
             return replace(plan, constant=constant)
         name = self.signal.name if bound is None else bound
-        found = self.job.binder.by_name(name, self.copy.esc)
+        role = None
+        if bound is None:
+            role = e2e_attributes.role_of(self.signal, self.job.database)
+        found = None if role else self.job.binder.by_name(name, self.copy.esc)
         if found is not None:
             return self._bound(plan, *found)
-        role = names.protection(name)
+        if self._is_data_id(name):
+            assert self.protection is not None
+            return replace(plan, role=Role.DATA_ID, constant=self.protection.nibble)
+        role = role or names.protection(name)
         if role is not None:
             if role is Role.ALIVE:
                 plan = _counted(plan, self.table)
@@ -218,6 +235,12 @@ class SignalCompiler:
         via = "" if bound is None else f" (bound by dbc.bind to {bound!r})"
         hints = self.job.binder.suggestions(name)
         raise UnfitSignal(f"no such source{via}.{hints} Bind it under [dbc.bind] or rename it.")
+
+    def _is_data_id(self, name: str) -> bool:
+        """Return True if the signal contains a part of the data id of an E2E profile."""
+        if self.protection is None or self.protection.profile.mode is not DataIdMode.NIBBLE:
+            return False
+        return names.is_data_id(name)
 
     def _bound(
         self,

@@ -6,6 +6,7 @@ as an answer of a CANopen node, is never replaced.
 
 from collections.abc import Iterable, Sequence
 from enum import Enum
+from itertools import pairwise
 from operator import itemgetter
 
 from kontronik_can_gw.frames import FIRST_PART, PARTS, CanFrame
@@ -37,8 +38,9 @@ class TransmitQueue:
     """Frames that wait to be sent. Its twin is ``put`` and ``hand_over`` of native/linux.c.
 
     1. A frame that is not ``queued`` replaces the waiting frame of its id and page, and keeps that
-       frame's place. If it belongs to a transfer and the older transfer of its id is half sent, it
-       is discarded instead.
+       frame's place. Frames of further pages that wait behind it move up first, because the frames
+       of a message share one alive counter, which must not run backward. If a frame belongs to a
+       transfer and the older transfer of its id is half sent, it is discarded instead.
     2. Frames of a step are sent in the order of ``put_all``: outputs, then slots, then messages.
     3. If the interface did not take all of them, queued and other frames alternate until no frame
        waits. Neither a flood of answers nor fast measurements can then keep the other kind from the
@@ -85,6 +87,9 @@ class TransmitQueue:
         else:
             if waiting:
                 frames = [frame for frame in frames if not self._has_begun(frame)]
+                for frame in frames:
+                    self._move_up_pages(frame)
+                waiting = self._waiting
             waiting.update(zip(map(_key_of, frames), frames, strict=True))
         lost = count - len(waiting)
         self.dropped += dropped
@@ -97,6 +102,7 @@ class TransmitQueue:
         for frame in frames:
             if not frame.queued:
                 if not self._has_begun(frame):
+                    self._move_up_pages(frame)
                     self._waiting[_key_of(frame)] = frame
             elif self._queued < QUEUE_LENGTH:
                 self._waiting[(self._next_number,)] = frame
@@ -105,6 +111,26 @@ class TransmitQueue:
             else:
                 dropped += 1
         return dropped
+
+    def _move_up_pages(self, frame: CanFrame) -> None:
+        """Give the waiting frame of an id and page the last place of the message's pages.
+
+        The pages behind it move up. Nothing changes if it does not wait, or is the last one.
+        """
+        own = _key_of(frame)
+        if frame.page >= FIRST_PART or own not in self._waiting:
+            return
+        items = [*self._waiting.items()]
+        places = [place for place, (key, _) in enumerate(items) if key[:2] == own[:2]]
+        keys = [items[place][0] for place in places]
+        start = keys.index(own)
+        if start == len(keys) - 1:
+            return
+        replaced = items[places[start]]
+        for place, behind in pairwise(places[start:]):
+            items[place] = items[behind]
+        items[places[-1]] = replaced
+        self._waiting = dict(items)
 
     def _has_begun(self, frame: CanFrame) -> bool:
         """Return True if a frame belongs to a transfer whose predecessor is half sent.

@@ -14,6 +14,7 @@ _FRAME_SIZE = c.sizeof(Frame)
 _SIZED = (
     "kcg_signal",
     "kcg_message",
+    "kcg_e2e",
     "kcg_settings",
     "kcg_plan",
     "kcg_esc",
@@ -24,7 +25,7 @@ _SIZED = (
     "kcg_turns",
 )
 """Structures in the order of kcg_sizes, kcg_offline_sizes and kcg_turns_size."""
-_IN_CORE = 6
+_IN_CORE = 7
 _IN_OFFLINE = 3
 """Numbers of structures whose sizes kcg_sizes and kcg_offline_sizes return."""
 _head = struct.Struct("=IBBB").unpack_from

@@ -85,6 +85,21 @@ uint32_t kcg_crc32(uint32_t crc, const uint8_t *p, size_t n)
     return ~c;
 }
 
+/* --- CRC-16 ----------------------------------------------------------------------------------- */
+
+enum { CCITT = 0x1021 };
+
+/* Returns the CRC of `size` bytes, continued from `crc`, the most significant bit first. */
+static uint32_t crc_16(uint32_t polynomial, uint32_t crc, const uint8_t *data, size_t size)
+{
+    for (; size; data++, size--) {
+        crc ^= (uint32_t)*data << 8;
+        for (int k = 0; k < 8; k++)
+            crc = crc << 1 ^ (crc & 0x8000 ? 0x10000u | polynomial : 0);
+    }
+    return crc & 0xFFFF;
+}
+
 /* --- bytes to UART frames (twin: esc/kontronik/deframer.py) ----------------------------------- */
 
 /* The four forms of frames, by [is info][LEGACY_FORM or V4_FORM]. */
@@ -1089,17 +1104,6 @@ uint64_t kcg_slot_sent(const kcg *g, uint32_t slot)
     return g->slot[slot].frames_sent;
 }
 
-/* CRC-16-CCITT. */
-static uint32_t crc_16(uint32_t crc, const uint8_t *data, size_t size)
-{
-    for (; size; data++, size--) {
-        crc ^= (uint32_t)*data << 8;
-        for (int k = 0; k < 8; k++)
-            crc = crc << 1 ^ (crc & 0x8000 ? 0x11021u : 0);
-    }
-    return crc & 0xFFFF;
-}
-
 /* Makes the frames of a transfer (twin: signals/transfer.py). f[0] contains the bare payload. */
 static void make_transfer(kcg *g, uint32_t i, kcg_frame *f)
 {
@@ -1113,7 +1117,7 @@ static void make_transfer(kcg *g, uint32_t i, kcg_frame *f)
     uint32_t number = slot_of(g, first)->transfer_number++ & 31u;
     memcpy(rest, f->data, size);
     if (parts > 1) {
-        uint32_t crc = crc_16(row->crc_seed, rest, size);
+        uint32_t crc = crc_16(CCITT, row->crc_seed, rest, size);
         data[0] = (uint8_t)crc;
         data[1] = (uint8_t)(crc >> 8);
         rest = data;
@@ -1245,24 +1249,21 @@ static int is_silent(const kcg *g, const kcg_message *m)
     return 1;
 }
 
-/* CRC-8 SAE J1850 without its inversions, as AUTOSAR E2E profile 1 uses it. */
-static uint8_t crc_8(uint8_t c, int byte)
+/* Writes the CRC of AUTOSAR E2E protection into a frame (twin: signals/e2e.py). */
+static void protect(const kcg *g, const kcg_message *m, uint32_t alive, kcg_frame *f)
 {
-    c ^= (uint8_t)byte;
-    for (int k = 0; k < 8; k++)
-        c = (uint8_t)(c & 0x80 ? c << 1 ^ 0x1D : c << 1);
-    return c;
-}
-
-/* Returns the CRC of AUTOSAR E2E profile 1: the data id, then the frame without byte `at` (twin:
-   signals/packer.py). */
-static uint8_t e2e_crc(const kcg_frame *f, int at, int data_id)
-{
-    uint8_t c = crc_8(crc_8(0, data_id), data_id >> 8);
-    for (int i = 0; i < f->length; i++)
-        if (i != at)
-            c = crc_8(c, f->data[i]);
-    return c;
+    const kcg_e2e *e = &g->plan->e2e[m->e2e];
+    uint32_t polynomial = e->polynomial, crc = e->start;
+    uint32_t data_id = e->data_id[alive % KCG_DATA_IDS];
+    uint8_t id[] = {(uint8_t)data_id, (uint8_t)(data_id >> 8)};
+    uint8_t *at = f->data + m->crc_at, *rest = at + e->crc_bytes, *end = f->data + f->length;
+    crc = crc_16(polynomial, crc, id, e->is_id_last ? 0 : e->id_bytes);
+    crc = crc_16(polynomial, crc, f->data, m->crc_at);
+    crc = crc_16(polynomial, crc, rest, (size_t)(end - rest));
+    crc = crc_16(polynomial, crc, id, e->is_id_last ? e->id_bytes : 0);
+    crc ^= e->final_xor;
+    at[0] = (uint8_t)crc;
+    at[e->crc_bytes - 1] = (uint8_t)(crc >> 8); /* the only byte of a CRC of 8 bits */
 }
 
 /* Little-endian. Not a loop, because GCC makes one store of it. */
@@ -1302,7 +1303,7 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     for (int k = 0; k < (int)WORDS_OF(m); k++) /* bytes beyond the length are 0 */
         put_u64(f->data + k * 8, bits[k]);
     if (KCG_E2E && m->flags & KCG_HAS_CRC)
-        f->data[m->crc_at] = e2e_crc(f, m->crc_at, m->data_id);
+        protect(g, m, s->alive, f);
 #if KCG_SLOTS
     if (m->flags & KCG_TRANSFER)
         make_transfer(g, i, f);
@@ -1669,6 +1670,7 @@ uint32_t kcg_sizes(uint32_t what)
         KCG_SOURCE,
         sizeof(kcg_signal),
         sizeof(kcg_message),
+        sizeof(kcg_e2e),
         sizeof(kcg_settings),
         sizeof(kcg_plan),
         sizeof(kcg_esc),

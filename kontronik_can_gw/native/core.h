@@ -29,7 +29,7 @@
 #define KCG_PAGED 1  /* 0: leaves out multiplexed messages. */
 #endif
 #ifndef KCG_E2E
-#define KCG_E2E 1    /* 0: leaves out the CRC of AUTOSAR E2E profile 1. */
+#define KCG_E2E 1    /* 0: leaves out the CRCs of AUTOSAR E2E protection. */
 #endif
 #ifndef KCG_SLICES
 #define KCG_SLICES 0 /* Tables of the CRC-32. 0: 64 bytes of flash. 1: 1 kB of RAM, faster.
@@ -163,7 +163,7 @@ enum {
     KCG_EVENT = 1,           /* Sent with each event in `triggers`. */
     KCG_ON_CHANGE = 2,       /* Sent with these events if its content has changed. */
     KCG_SILENT_ON_LOSS = 4,  /* Not sent while all of its ESCs are without live data. */
-    KCG_HAS_CRC = 8,         /* Has the CRC of AUTOSAR E2E profile 1 at byte `crc_at`. */
+    KCG_HAS_CRC = 8,         /* Has a CRC of AUTOSAR E2E protection at byte `crc_at`. */
     KCG_OF_THE_GATEWAY = 16, /* Has values of the gateway, and is sent by kcg_gateway_changed. */
     KCG_FREE = 32,           /* Has neither cycle nor minimum distance, and one page. */
     KCG_TRANSFER = 64,       /* Slots only: several frames with a CRC-16, as in DroneCAN. */
@@ -209,13 +209,23 @@ typedef struct {
        triggers: events that request the message. crc_at: offset of the E2E CRC in bytes.
        escs: number of ESCs with values in the message. */
     uint8_t length, words, flags, triggers, pages, crc_at, escs, fd_flags;
-    /* data_id: E2E data id. first_page: index into kcg.page.
+    /* e2e: index into kcg_plan.e2e, with KCG_HAS_CRC. first_page: index into kcg.page.
        last_alive: highest value of the alive counter, which begins at 0. */
-    uint16_t first_signal, signals, data_id, first_page, last_alive;
+    uint16_t first_signal, signals, e2e, first_page, last_alive;
     uint32_t first_word; /* Index into kcg_plan.constant, which has `words` for each page. */
     uint32_t first_esc;  /* Index into kcg_plan.esc_of, which has `escs` numbers for the message. */
     int64_t cycle, delay, phase; /* In ns. delay: minimum distance between two frames. */
 } kcg_message;
+enum { KCG_DATA_IDS = 16 };
+/* The CRC of a protected message (twin: signals/e2e.py). */
+typedef struct {
+    /* A CRC of 8 bits is computed as one of 16 bits: these numbers are shifted by 8 bits. */
+    uint16_t polynomial, start, final_xor;
+    /* crc_bytes: 1, or 2 with the low byte first. id_bytes: bytes of the data id in the CRC.
+       is_id_last: 1: they follow the frame's bytes. 0: they precede them. */
+    uint8_t crc_bytes, id_bytes, is_id_last, reserved;
+    uint16_t data_id[KCG_DATA_IDS]; /* The data id for each counter, modulo 16. */
+} kcg_e2e;
 /* A slot, besides its kcg_message. */
 typedef struct {
     uint64_t watched;  /* Bits whose change requests the slot. 0: each event in `triggers` does. */
@@ -239,6 +249,7 @@ typedef struct {
     const kcg_piece *piece;
     const kcg_pair *pair;
     const uint64_t *constant;
+    const kcg_e2e *e2e;
     const uint16_t *esc_of;
     /* Messages that follow events of ESC i: the entries of `listener` from first_listener[i] to
        first_listener[i + 1] - 1. */
@@ -467,9 +478,9 @@ uint64_t kcg_count(const kcg_esc *e, int what);
    KCG_SLICES, call kcg_init before. */
 uint32_t kcg_crc32(uint32_t crc, const uint8_t *data, size_t size);
 #if KCG_SOURCE
-/* Returns KCG_SOURCE for 0, and for 1 to 6 the size of kcg_signal, kcg_message, kcg_settings,
-   kcg_plan, kcg_esc and kcg_frame. A caller that cannot include this file compares them with its
-   own sizes. */
+/* Returns KCG_SOURCE for 0, and for 1 to 7 the size of kcg_signal, kcg_message, kcg_e2e,
+   kcg_settings, kcg_plan, kcg_esc and kcg_frame. A caller that cannot include this file compares
+   them with its own sizes. */
 uint32_t kcg_sizes(uint32_t what);
 #endif
 

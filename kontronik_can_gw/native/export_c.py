@@ -173,7 +173,10 @@ def _rows(
         fields = []
         for name, typed in kind._fields_:
             value = getattr(row, name)
-            if isinstance(value, int) and value:
+            if isinstance(value, ctypes.Array) and any(value):
+                texts = [_number(typed._type_, number) for number in value]
+                fields.append(f".{name} = {{{', '.join(texts)}}}")
+            elif isinstance(value, int) and value:
                 fields.append(f".{name} = {_number(typed, value)}")
         if labels:
             yield f"    /* {_plain(labels[place])} */"

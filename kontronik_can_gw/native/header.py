@@ -45,7 +45,15 @@ class _Row(c.Structure):
             raise NotInCore(f"{name} {value} is too large")
 
 
-_ROWS = {"kcg_piece", "kcg_pair", "kcg_signal", "kcg_message", "kcg_settings", "kcg_slot_row"}
+_ROWS = {
+    "kcg_piece",
+    "kcg_pair",
+    "kcg_signal",
+    "kcg_message",
+    "kcg_e2e",
+    "kcg_settings",
+    "kcg_slot_row",
+}
 _TYPES: dict[str, Any] = {
     "int": c.c_int,
     "int16_t": c.c_int16,

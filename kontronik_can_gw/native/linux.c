@@ -190,6 +190,12 @@ static void put(kcg_turns *t, const kcg_frame *made)
     if (is_late)
         return;
     q->count += i == q->count;
+    /* Pages of the message that wait behind it move up, so that its counter does not run back. */
+    for (uint32_t k = i + 1; k < q->count && made->page < KCG_FIRST_PART; k++)
+        if (q->frame[k].id == made->id) {
+            q->frame[i] = q->frame[k];
+            i = k;
+        }
     q->frame[i] = *made;
 }
 

@@ -9,11 +9,13 @@ from typing import Any
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.header import KCG, enumeration, structure
 from kontronik_can_gw.native.header import NotInCore as NotInCore
+from kontronik_can_gw.signals.e2e import Protection
 
 Piece = structure("kcg_piece")
 Pair = structure("kcg_pair")
 Signal = structure("kcg_signal")
 Message = structure("kcg_message")
+E2e = structure("kcg_e2e")
 Settings = structure("kcg_settings")
 SlotRow = structure("kcg_slot_row")
 COUNTS = enumeration("KCG_N_BYTES", "KCG_N_")
@@ -58,6 +60,22 @@ class Rows:
 
     def __iter__(self) -> Iterator[Any]:
         return (self[place] for place in range(len(self)))
+
+
+def e2e_row(protection: Protection) -> Any:
+    """Return the numbers of a protected message. Those of a CRC of 8 bits are shifted."""
+    profile = protection.profile
+    shift = 16 - profile.crc_bits
+    row = E2e(
+        polynomial=profile.polynomial << shift,
+        start=profile.start << shift,
+        final_xor=profile.final_xor << shift,
+        crc_bytes=profile.crc_bytes,
+        id_bytes=protection.id_bytes,
+        is_id_last=int(protection.is_id_last),
+    )
+    row.data_id[:] = protection.ids_by_counter
+    return row
 
 
 def bind_direction(

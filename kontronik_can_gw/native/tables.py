@@ -22,6 +22,7 @@ from kontronik_can_gw.native.rows import (
     COUNTS,
     GATEWAY,
     WIRE_TYPES,
+    E2e,
     Message,
     NotInCore,
     Pair,
@@ -29,6 +30,7 @@ from kontronik_can_gw.native.rows import (
     Rows,
     Signal,
     bind_direction,
+    e2e_row,
     settings_of,
 )
 from kontronik_can_gw.native.scale import set_scale
@@ -65,6 +67,7 @@ class Tables:
         self.messages = Rows(Message)
         self.pieces = Rows(Piece)
         self.pairs = Rows(Pair)
+        self.e2e = Rows(E2e)
         self.constants: list[int] = []
         self.esc_of: list[int] = []
         self.pages = 0
@@ -123,6 +126,7 @@ class Tables:
             "piece": (Piece, self.pieces),
             "pair": (Pair, self.pairs),
             "constant": (c_uint64, self.constants),
+            "e2e": (E2e, self.e2e),
             "esc_of": (c_uint16, self.esc_of),
             "listener": (c_uint16, self.listeners),
             "first_listener": (c_uint16, self.first_listeners),
@@ -156,7 +160,7 @@ class Tables:
             self.constants += _constants(plan, page, words)
         for signal in plan.signals:
             if signal.role in (Role.SOURCE, Role.ALIVE):
-                self._add_signal(signal, plan, crc is not None)
+                self._add_signal(signal, plan)
         first_esc = len(self.esc_of)
         self.esc_of += sorted(plan.escs)
         key = plan.can_id
@@ -174,7 +178,7 @@ class Tables:
             fd_flags=int(plan.fd),
             first_signal=first_signal,
             signals=len(self.signals) - first_signal,
-            data_id=plan.data_id & 0xFFFF,
+            e2e=len(self.e2e) if plan.e2e else 0,
             first_page=self.pages,
             last_alive=max(0, traits.alive_modulus - 1),
             first_word=first_word,
@@ -184,14 +188,11 @@ class Tables:
             phase=phase,
         )
         self.messages.append(row)
+        if plan.e2e is not None:
+            self.e2e.append(e2e_row(plan.e2e))
         self.pages += len(plan.pages)
 
-    def _add_signal(
-        self,
-        signal: SignalPlan,
-        plan: MessagePlan,
-        has_crc: bool,
-    ) -> None:
+    def _add_signal(self, signal: SignalPlan, plan: MessagePlan) -> None:
         if signal.length > MAX_BITS:
             raise NotInCore(f"{plan.name}.{signal.name}: too long ({signal.length} bits)")
         first_piece = len(self.pieces)
@@ -215,7 +216,7 @@ class Tables:
         row.not_available = signal.not_available & _M64
         if signal.role is Role.ALIVE:
             row.kind = KCG.OF_ALIVE
-            row.div = alive_modulus(signal, has_crc)
+            row.div = alive_modulus(signal, plan.e2e)
             if row.div > MAX_ALIVE:
                 name = f"{plan.name}.{signal.name}"
                 raise NotInCore(f"{name}: an alive counter of {signal.length} bits is too long")
@@ -316,7 +317,7 @@ def places_of(protocol: EscProtocol) -> Places:
 def _constants(plan: MessagePlan, page: int | None, words: int) -> list[int]:
     bits = 0
     for signal in plan.compiled:
-        if signal.role is Role.CONSTANT and signal.page in (None, page):
+        if signal.role in (Role.CONSTANT, Role.DATA_ID) and signal.page in (None, page):
             bits |= place(signal.pieces, signal.constant)
         elif signal.role is Role.MULTIPLEXER and page is not None:
             bits |= place(signal.pieces, page)

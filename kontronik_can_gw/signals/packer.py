@@ -13,6 +13,7 @@ from fractions import Fraction
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.esc.values import divisor, steps
 from kontronik_can_gw.frames import FIRST_PART, CanFrame
+from kontronik_can_gw.signals.e2e import Protection
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 from kontronik_can_gw.status import GatewayStatus
 
@@ -42,21 +43,19 @@ def extract(pieces: Sequence[Piece], bits: int) -> int:
     return sum((bits >> piece.at & (1 << piece.width) - 1) << piece.shift for piece in pieces)
 
 
-def alive_modulus(signal: SignalPlan, has_crc: bool) -> int:
+def alive_modulus(signal: SignalPlan, e2e: Protection | None) -> int:
     """Return the number of values of an alive counter. It counts from 0 and then restarts.
 
-    It uses all values of its bits. In a message with a CRC it counts to 14 at most, as E2E profile
-    1 requires.
+    It uses all values of its bits, or as many as the E2E profile of its message.
     """
     modulus = signal.high + 1
-    return min(modulus, 15) if has_crc else modulus
+    return modulus if e2e is None else min(modulus, e2e.profile.counters)
 
 
 def compile_pack(plan: MessagePlan) -> Pack:
     """Return the function that packs the message's bits."""
-    has_crc = any(signal.role is Role.CRC for signal in plan.signals)
     counters = [
-        (signal.pieces, alive_modulus(signal, has_crc))
+        (signal.pieces, alive_modulus(signal, plan.e2e))
         for signal in plan.signals
         if signal.role is Role.ALIVE
     ]
@@ -83,7 +82,6 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
     """Return the function that makes the message's frame."""
     pack = compile_pack(plan)
     crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
-    crc_byte = crc.pieces[0].at // 8 if crc is not None else 0
 
     def make_frame(
         escs: Sequence[EscTelemetry],
@@ -92,10 +90,9 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
         alive: int,
         at: int,
     ) -> CanFrame:
-        bits = pack(escs, gateway, now, alive, at)
-        data = bits.to_bytes(plan.length, "little")
-        if crc is not None:
-            data = _insert_crc(data, crc_byte, plan.data_id)
+        data = pack(escs, gateway, now, alive, at).to_bytes(plan.length, "little")
+        if crc is not None and plan.e2e is not None:
+            data = plan.e2e.insert_crc(data, crc.pieces[0].at // 8, alive)
         # FIRST_PART and greater numbers mean a part of a transfer. Negative numbers are free.
         page = at if at < FIRST_PART else -at
         return CanFrame(plan.can_id, data, plan.extended, plan.fd, page)
@@ -114,7 +111,7 @@ def _compile_page(
             constant |= place(signal.pieces, page or 0)
         elif signal.page not in (None, page):
             continue
-        elif signal.role is Role.CONSTANT:
+        elif signal.role in (Role.CONSTANT, Role.DATA_ID):
             constant |= place(signal.pieces, signal.constant)
         elif signal.source is not None:
             sources.append((signal.pieces, _compile_raw(signal)))
@@ -279,38 +276,3 @@ def float_of(bits: int, length: int) -> float:
     data = bits.to_bytes(length // 8, "little")
     (number,) = struct.unpack(_FLOATS[length], data)
     return number
-
-
-def _crc_table() -> bytes:
-    """Return the table of CRC-8 SAE J1850, polynomial 1Dh."""
-    table = []
-    for byte in range(256):
-        value = byte
-        for _ in range(8):
-            value <<= 1
-            if value & 0x100:
-                value ^= 0x11D
-        table.append(value)
-    return bytes(table)
-
-
-_CRC = _crc_table()
-
-
-def e2e_crc(data: bytes, at: int, data_id: int) -> int:
-    """Return the CRC of AUTOSAR E2E profile 1 (PRS_E2EProtocol) for a frame with its CRC at ``at``.
-
-    It is computed over low byte and high byte of the data id, then all other bytes of the frame.
-    Start value and final XOR are 0.
-    """
-    value = 0
-    covered = data_id.to_bytes(2, "little") + data[:at] + data[at + 1 :]
-    for byte in covered:
-        value = _CRC[value ^ byte]
-    return value
-
-
-def _insert_crc(data: bytes, at: int, data_id: int) -> bytes:
-    """Return the frame with its CRC in byte ``at``."""
-    crc = e2e_crc(data, at, data_id)
-    return data[:at] + bytes([crc]) + data[at + 1 :]

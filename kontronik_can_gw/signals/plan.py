@@ -13,6 +13,7 @@ from typing import NamedTuple
 from zlib import crc32
 
 from kontronik_can_gw.esc.values import Group, Value
+from kontronik_can_gw.signals.e2e import Protection
 
 
 class SendType(Flag):
@@ -46,6 +47,8 @@ class Role(Enum):
     SOURCE = "source"
     ALIVE = "alive counter"
     CRC = "CRC"
+    DATA_ID = "E2E data id"
+    """Bits 8 to 11 of the data id, a constant."""
     CONSTANT = "constant"
     MULTIPLEXER = "multiplexer"
 
@@ -139,8 +142,8 @@ class MessagePlan:
     """Groups whose data changes the message's values."""
     pages: tuple[int | None, ...] = (None,)
     """Values of the multiplexer, one frame for each. None: without a multiplexer."""
-    data_id: int = 0
-    """Data id of AUTOSAR E2E profile 1, if the message has a CRC signal."""
+    e2e: Protection | None = None
+    """AUTOSAR E2E protection. None: the message has no CRC signal."""
     renamed: tuple[str, str] | None = None
     """For a copy for another ESC: prefix of the signals' names in ``compiled``, and prefix here."""
 

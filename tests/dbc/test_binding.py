@@ -12,8 +12,6 @@ from typing import Any
 import pytest
 from dbc_bench import compiled, gateway_with, packed, refused
 from e2e import p01
-from hypothesis import given
-from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get
 
 from kontronik_can_gw.dbc.names import Binder
@@ -21,7 +19,6 @@ from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.signals.packer import e2e_crc
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS
 
@@ -206,20 +203,6 @@ def theirs(data: bytes, at: int, data_id: int) -> bytes:
     buffer = bytearray(data)
     p01.e2e_p01_protect(buffer, data_id, offset=at, increment_counter=False)
     return bytes(buffer)
-
-
-@given(
-    st.binary(min_size=2, max_size=64),
-    st.integers(0, 0xFFFF),
-    st.data(),
-)
-def test_the_crc_equals_the_one_of_the_autosar_package_at_every_place(
-    data: bytes,
-    data_id: int,
-    draw: st.DataObject,
-) -> None:
-    at = draw.draw(st.integers(0, len(data) - 2))
-    assert e2e_crc(data, at, data_id) == theirs(data, at, data_id)[at]
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.rows import GATEWAY, MAX_GEAR, NotInCore
 from kontronik_can_gw.native.slots import slot_rows
+from kontronik_can_gw.signals.e2e import PROFILES, DataIdMode, Profile
 from kontronik_can_gw.signals.packer import compile_pack
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, Piece, Role, SendType, SignalPlan
 from kontronik_can_gw.status import GatewayStatus
@@ -79,7 +80,8 @@ def dbc(
     maker = LayoutMaker(chance, escs)
     messages = [maker.message() for _ in range(chance.randint(1, most))]
     if chance.random() < 0.4:
-        messages.append(protected(chance, escs))
+        profile = chance.choice(list(PROFILES))
+        messages.append(protected(chance, escs, PROFILES[profile]))
     attributes = []
     for message in messages:
         place = f"BO_ {message.dbc_id}"
@@ -89,9 +91,15 @@ def dbc(
         attributes.append(f'BA_ "GenMsgSendType" {place} {send_type};')
         attributes.append(f'BA_ "GenMsgCycleTime" {place} {cycle};')
         attributes.append(f'BA_ "GenMsgDelayTime" {place} {delay};')
-    has_protected = any(message.name == "Protected" for message in messages)
-    ids = {"Protected": 0x1234} if has_protected else {}
-    config = DbcConfig(bind=bindings(messages), e2e_data_ids=ids)
+    e2e: dict[str, str] = {}
+    ids: dict[str, int | tuple[int, ...]] = {}
+    if any(signal.name == "Crc8" for message in messages for signal in message.signals):
+        e2e["Protected"] = profile
+        largest = PROFILES[profile].largest_id
+        ids["Protected"] = chance.randint(0, largest)
+        if PROFILES[profile].ids > 1:
+            ids["Protected"] = tuple(chance.randint(0, largest) for _ in range(16))
+    config = DbcConfig(bind=bindings(messages), e2e=e2e, e2e_data_ids=ids)
     return dbc_text(messages, "\n".join(attributes)), config
 
 
@@ -109,14 +117,22 @@ def layout(
             continue
 
 
-def protected(chance: random.Random, escs: Sequence[EscSettings]) -> Msg:
-    """Return a message with an alive counter and perhaps a CRC of AUTOSAR E2E profile 1."""
+def protected(chance: random.Random, escs: Sequence[EscSettings], profile: Profile) -> Msg:
+    """Return a message with an alive counter, and perhaps with the CRC of a profile."""
     prefix = f"Esc{chance.randint(1, len(escs))}" if len(escs) > 1 else ""
-    voltage = Sig(f"{prefix}BatteryVoltage", 24, 16, unit="V", factor="0.01")
-    signals = [Sig("Alive", 8, chance.choice((2, 4, 8, 16))), voltage]
-    if chance.random() < 0.7:
-        signals.append(Sig("Crc8", 0, 8))
-    return Msg("Protected", 0x7F0, chance.randint(5, 8), signals)
+    at = 0 if profile.crc_byte == 0 else chance.choice((0, 4))
+    value_at = 0 if at else 5
+    counter_at = 8 * at + profile.crc_bits
+    counter_bits = profile.counter_bits or chance.choice((2, 4, 8, 16))
+    signals = [
+        Sig(f"{prefix}BatteryVoltage", 8 * value_at, 16, unit="V", factor="0.01"),
+        Sig("Alive", counter_at, counter_bits),
+    ]
+    if chance.random() < 0.9:
+        signals.append(Sig("Crc8", 8 * at, profile.crc_bits))
+        if profile.mode is DataIdMode.NIBBLE:
+            signals.append(Sig("DataIdNibble", 16 if at else 32, 4))
+    return Msg("Protected", 0x7F0, chance.choice((7, 8, 8, 12, 64)), signals)
 
 
 def stream(chance: random.Random) -> bytes:

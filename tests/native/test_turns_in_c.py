@@ -367,7 +367,7 @@ def test_sending_to_a_busy_driver_is_retried_every_two_milliseconds(
 def test_a_slow_bus_gets_the_newest_pages_of_a_multiplexed_message(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A waiting page is replaced only by a newer version of the same page."""
+    """A waiting page is replaced only by a newer version of the same page, and pages keep order."""
     signals = [Sig("Page", 0, 8, mux="M")]
     source = "electrical_speed"
     for page in range(8):
@@ -390,11 +390,13 @@ def test_a_slow_bus_gets_the_newest_pages_of_a_multiplexed_message(
     transmitter = it.loop.can.transmitter
     it.loop.close()
     pages: dict[int, list[int]] = {}
+    order: list[int] = []
     after: Counter[int] = Counter()
     for at, frame in it.bus.sent:
         if at > it.begun + SECOND:
             speed = int.from_bytes(frame.data[1:5], "little")
             pages.setdefault(frame.data[0], []).append(speed)
+            order.append(speed)
             period, place = divmod(at - it.begun, SECOND)
             if place < 400 * MS:
                 assert at - made[speed - 1] <= 90 * MS, "the eight pages come round in 80 ms"
@@ -404,6 +406,7 @@ def test_a_slow_bus_gets_the_newest_pages_of_a_multiplexed_message(
     assert sorted(pages) == list(range(8))
     for speeds in pages.values():
         assert speeds == sorted(set(speeds))
+    assert order == sorted(order), "an alive counter of the message would run backward"
     assert status.replaced_frames > 15
     assert not transmitter.is_stalled
     assert status.dropped_frames == 0

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from command_line import run, written
+from packer_oracle import Msg, Sig, dbc_text
 from put_in_faults import Fault
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -95,7 +96,30 @@ def test_a_dbc_of_the_golden_set_is_proven_except_floats_and_crcs(
     assert found["refuted"] == []
     assert found["proven"]
     reasons = {line.partition(": ")[2] for line in found["unproven"]}
-    assert reasons <= {"a float", "a CRC: only its place and its data id are compared"}
+    assert reasons <= {"a float", "a CRC: only its place and its numbers are compared"}
+
+
+@pytest.mark.parametrize("profile", ["1A", "1B", "1C", "2", "5", "11A", "11C", "22"])
+def test_an_e2e_message_is_proven_except_the_computation_of_its_crc(
+    tmp_path: Path, profile: str
+) -> None:
+    crc_bits = 16 if profile == "5" else 8
+    signals = [
+        Sig("M_CRC", 0, crc_bits),
+        Sig("M_BZ", crc_bits, 8 if profile == "5" else 4),
+        Sig("BatteryVoltage", 24, 16, unit="V", factor="0.01"),
+    ]
+    if profile.endswith("C"):
+        signals.append(Sig("M_DataIDNibble", crc_bits + 4, 4))
+    dbc = written(tmp_path / "e2e.dbc", dbc_text([Msg("M", 0x123, 8, signals)]))
+    data_ids: object = [*range(3, 19)] if profile in ("2", "22") else 0xACD
+    text = f'{ONE_ESC}[dbc]\nfile = "{dbc}"\nnode = "Gateway"\n[dbc.e2e]\nM = "{profile}"\n'
+    text += f"[dbc.e2e_data_ids]\nM = {data_ids}\n"
+    found = proof_of(written(tmp_path / "gateway.toml", text))
+    assert found["refuted"] == []
+    assert found["only_python"] == ""
+    assert found["unproven"] == ["M.M_CRC: a CRC: only its place and its numbers are compared"]
+    assert {"M.M_BZ", "M.BatteryVoltage"} <= {*found["proven"]}
 
 
 def test_a_layout_that_only_python_can_send_is_proven_for_python(tmp_path: Path) -> None:

@@ -204,9 +204,11 @@ def _notes(message: MessagePlan, plan: SignalPlan) -> list[str]:
         found = reporter(message, plan)
         if found is not None:
             notes.append(f"{found.name} reports the loss")
+    if plan.role is Role.CRC:
+        notes.append(str(message.e2e))
     if plan.unbound:
         notes.append(f"not bound to a value: always {held(plan)}")
-    elif plan.role is Role.CONSTANT:
+    elif plan.role in (Role.CONSTANT, Role.DATA_ID):
         notes.append(f"always raw {plan.constant}")
     return [f"{note[:1].upper()}{note[1:]}." for note in notes]
 

@@ -15,9 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.copies import Copy
+from kontronik_can_gw.dbc.e2e_attributes import role_of
 from kontronik_can_gw.dbc.expand import copies_of
-from kontronik_can_gw.dbc.names import Binder, protection
+from kontronik_can_gw.dbc.names import Binder, is_data_id, protection
+from kontronik_can_gw.dbc.protection import stated_data_ids, stated_profile
 from kontronik_can_gw.dbc.reader import attribute, choose_node
+from kontronik_can_gw.desk.proof.end_to_end import COUNTERS, CrcRule, expected_rule
 from kontronik_can_gw.desk.proof.quantities import QUANTITIES, Quantity, size
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
@@ -30,8 +33,6 @@ if TYPE_CHECKING:
 _TEXTS_OF_NOT_AVAILABLE = ("notavailable", "sna", "na", "signalnotavailable")
 _TEXTS_OF_ERROR = ("error", "err", "invalid")
 _HALF = Fraction(1, 2)
-_MOST_WITH_CRC = 15
-"""Number of values of an alive counter beside an E2E CRC."""
 
 
 class Shape(Enum):
@@ -126,7 +127,8 @@ class ExpectedMessage:
     extended: bool
     length: int
     pages: tuple[int | None, ...]
-    data_id: int
+    crc: CrcRule | None
+    """None without a CRC."""
     multiplexer: tuple[int, ...]
     """Bits of the multiplexer. Empty without one."""
     signals: tuple[ExpectedSignal, ...]
@@ -152,13 +154,13 @@ def _message(
         pages.update(signal.multiplexer_ids or ())
     multiplexer: tuple[int, ...] = ()
     signals = []
-    has_crc = _has_crc(copy, binder)
+    protection = _protection(database, copy, binder, settings)
     for signal in message.signals:
         if signal.is_multiplexer:
             multiplexer = bits_of(signal)
             continue
         for page in signal.multiplexer_ids or (None,):
-            made = _Signal(database, copy, signal, binder, settings, has_crc).made(page)
+            made = _Signal(database, copy, signal, binder, settings, protection).made(page)
             signals.append(made)
     return ExpectedMessage(
         name=copy.name,
@@ -166,19 +168,37 @@ def _message(
         extended=message.is_extended_frame,
         length=message.length,
         pages=tuple(sorted(pages)) or (None,),
-        data_id=settings.e2e_data_ids.get(copy.name, copy.frame_id & 0xFFFF),
+        crc=None if protection is None else expected_rule(*protection),
         multiplexer=multiplexer,
         signals=tuple(signals),
     )
 
 
-def _has_crc(copy: Copy, binder: Binder) -> bool:
+def _protection(
+    database: "Database",
+    copy: Copy,
+    binder: Binder,
+    settings: DbcConfig,
+) -> tuple[str, tuple[int, ...]] | None:
+    """Return E2E profile and data ids of a message. None without a CRC."""
+    if not _has_crc(database, copy, binder):
+        return None
+    profile, _ = stated_profile(settings, database, copy)
+    if profile is None:
+        return "1A", (copy.frame_id & 0xFFFF,)
+    return profile.name, stated_data_ids(settings, database, copy, profile)
+
+
+def _has_crc(database: "Database", copy: Copy, binder: Binder) -> bool:
     for signal in copy.message.signals:
         bound = binder.bound(copy, signal.name)
         name = signal.name if bound is None else bound
-        if not isinstance(name, str) or binder.by_name(name, copy.esc) is not None:
+        if not isinstance(name, str):
             continue
-        if protection(name) is Role.CRC and not signal.is_multiplexer:
+        stated = role_of(signal, database) if bound is None else None
+        if stated is None and binder.by_name(name, copy.esc) is not None:
+            continue
+        if (stated or protection(name)) is Role.CRC and not signal.is_multiplexer:
             return True
     return False
 
@@ -212,14 +232,15 @@ class _Signal:
         signal: "Signal",
         binder: Binder,
         settings: DbcConfig,
-        has_crc: bool,
+        protection: tuple[str, tuple[int, ...]] | None,
     ) -> None:
         self.database = database
         self.copy = copy
         self.signal = signal
         self.binder = binder
         self.settings = settings
-        self.has_crc = has_crc
+        self.protection = protection
+        """E2E profile and data ids of the message. None without a CRC."""
         self.unit = _unit(signal, settings)
         texts: list[tuple[int, str]] = []
         for raw, text in (signal.choices or {}).items():
@@ -238,7 +259,9 @@ class _Signal:
         if isinstance(bound, (int, float)):
             rule = self._constant((_exact(bound) - self._offset) / self._factor)
         else:
-            found = self.binder.by_name(bound or self.signal.name, self.copy.esc)
+            role = role_of(self.signal, self.database) if bound is None else None
+            known_name = bound or self.signal.name
+            found = None if role else self.binder.by_name(known_name, self.copy.esc)
             if found is not None:
                 value, esc = found
                 source = value.name
@@ -248,9 +271,17 @@ class _Signal:
                     reason = f"{value.name} is not in the sheet of the proof"
                 else:
                     rule = self._with_source(QUANTITIES[value.name], esc, value.names)
+            elif self._has_data_id_nibble and is_data_id(known_name):
+                assert self.protection is not None
+                rule = self._constant(self.protection[1][0] >> 8 & 0xF)
             else:
-                rule = self._without_source(protection(bound or self.signal.name))
+                rule = self._without_source(role or protection(known_name))
         return ExpectedSignal(name, source, self.unit, page, bits, rule, reason)
+
+    @property
+    def _has_data_id_nibble(self) -> bool:
+        """True if the frame contains 4 bits of the data id."""
+        return self.protection is not None and self.protection[0] in ("1C", "11C")
 
     @property
     def _factor(self) -> Fraction:
@@ -335,9 +366,9 @@ class _Signal:
             return self._base(Shape.CRC)
         if role is Role.ALIVE:
             modulus = self._modulus()
-            return self._base(
-                Shape.ALIVE, modulus=min(modulus, _MOST_WITH_CRC) if self.has_crc else modulus
-            )
+            if self.protection is not None:
+                modulus = min(modulus, COUNTERS[self.protection[0]])
+            return self._base(Shape.ALIVE, modulus=modulus)
         named = self._raws(_TEXTS_OF_NOT_AVAILABLE)
         if named and not self.start_is_set:
             if self.signal.is_float:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from kontronik_can_gw.desk.proof.end_to_end import CrcRule, rule_of_c, rule_of_python
 from kontronik_can_gw.desk.proof.quantities import (
     HEADER,
     PRODUCT,
@@ -120,7 +121,7 @@ class PlannedMessage:
     can_id: int
     extended: bool
     length: int
-    data_id: int | None
+    crc: CrcRule | None
     """None without a CRC."""
     crc_at: int
     """Byte of the CRC."""
@@ -138,13 +139,13 @@ def of_python(plan: MessagePlan, escs: Sequence[EscSettings]) -> PlannedMessage:
         for signal in plan.signals:
             if signal.role is Role.MULTIPLEXER:
                 bits |= place(signal.pieces, page or 0)
-            elif signal.role is Role.CONSTANT and signal.page in (None, page):
+            elif signal.role in (Role.CONSTANT, Role.DATA_ID) and signal.page in (None, page):
                 bits |= place(signal.pieces, signal.constant)
         constants[page] = bits
     signals = []
     for signal in plan.signals:
         if signal.role is Role.ALIVE:
-            modulus = alive_modulus(signal, crc is not None)
+            modulus = alive_modulus(signal, plan.e2e)
             made = PlannedSignal(signal.name, signal.page, signal.pieces, None, modulus)
         elif signal.role is Role.SOURCE:
             protocol = protocol_named(escs[signal.esc or 0].protocol)
@@ -157,7 +158,7 @@ def of_python(plan: MessagePlan, escs: Sequence[EscSettings]) -> PlannedMessage:
         can_id=plan.can_id,
         extended=plan.extended,
         length=plan.length,
-        data_id=None if crc is None else plan.data_id,
+        crc=None if plan.e2e is None else rule_of_python(plan.e2e),
         crc_at=0 if crc is None else crc.pieces[0].at // 8,
         constants=constants,
         signals=tuple(signals),
@@ -255,7 +256,7 @@ def of_c(plan: MessagePlan, index: int, tables: Tables) -> PlannedMessage:
         can_id=row.id & ~extended,
         extended=bool(row.id & extended),
         length=row.length,
-        data_id=row.data_id if row.flags & KCG.HAS_CRC else None,
+        crc=rule_of_c(tables.e2e[row.e2e]) if row.flags & KCG.HAS_CRC else None,
         crc_at=row.crc_at,
         constants=constants,
         signals=tuple(signals),

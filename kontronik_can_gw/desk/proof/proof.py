@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.desk.proof import words
+from kontronik_can_gw.desk.proof.end_to_end import CrcRule
 from kontronik_can_gw.desk.proof.expected import (
     Expected,
     ExpectedMessage,
@@ -162,7 +163,7 @@ class Prover:
             return
         if rule.shape is Shape.CRC:
             yield from _wrong_crc(signal, plan)
-            reasons.append("a CRC: only its place and its data id are compared")
+            reasons.append("a CRC: only its place and its numbers are compared")
             return
         found = [each for each in plan.signals if _is_on(each, signal)]
         if len(found) != 1:
@@ -234,8 +235,10 @@ def _frame_problems(expected: ExpectedMessage, plan: PlannedMessage) -> Iterator
         yield f"is sent with id {plan.can_id:X}h, not {expected.can_id:X}h"
     if plan.length != expected.length:
         yield f"is sent with {plan.length} bytes, not {expected.length}"
-    if plan.data_id not in (None, expected.data_id & 0xFFFF):
-        yield f"its CRC has the data id {plan.data_id:X}h, not {expected.data_id & 0xFFFF:X}h"
+    if plan.crc is not None and expected.crc is not None:
+        for name, number, wanted in zip(CrcRule._fields, plan.crc, expected.crc, strict=True):
+            if number != wanted:
+                yield f"its CRC has {name.replace('_', ' ')} {number}, not {wanted}"
     known = {(signal.name, signal.page) for signal in expected.signals}
     for signal in plan.signals:
         if (signal.name, signal.page) not in known:
@@ -268,9 +271,9 @@ def _wrong_constant(signal: ExpectedSignal, rule: Expected, plan: PlannedMessage
 
 
 def _wrong_crc(signal: ExpectedSignal, plan: PlannedMessage) -> Iterator[str]:
-    if plan.data_id is None:
+    if plan.crc is None:
         yield "the message is sent without its CRC"
-    elif signal.bits != tuple(range(8 * plan.crc_at, 8 * plan.crc_at + 8)):
+    elif set(signal.bits) != set(range(8 * plan.crc_at, 8 * plan.crc_at + plan.crc.bits)):
         yield f"its CRC is sent in byte {plan.crc_at}"
 
 

@@ -1,0 +1,263 @@
+"""Finds the end-to-end protection of a message, and checks that the message fits the profile.
+
+In this order: [dbc.e2e], the attributes of the DBC, [dbc.e2e_data_ids] alone, and the names of CRC
+and counter.
+"""
+
+import fnmatch
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.dbc import e2e_attributes
+from kontronik_can_gw.dbc.copies import Copy
+from kontronik_can_gw.dbc.e2e_attributes import UnclearAttribute
+from kontronik_can_gw.dbc.names import is_e2e
+from kontronik_can_gw.dbc.signal_compiler import Compilation
+from kontronik_can_gw.signals.e2e import DATA_IDS, PROFILES, DataIdMode, Profile, Protection
+from kontronik_can_gw.signals.plan import Role, SignalPlan
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+
+_DEFAULT = PROFILES["1A"]
+"""The profile of a message whose configuration names only a data id."""
+
+
+def stated_protection(job: Compilation, copy: Copy) -> Protection | None:
+    """Return the protection that configuration or DBC state for a message. None if neither does.
+
+    Adds a line to ``job.problems`` for a statement that is unclear or incomplete.
+    """
+    where = f"{job.file}: {copy.message.name}"
+    try:
+        profile, is_of_dbc = stated_profile(job.settings, job.database, copy)
+        if profile is None:
+            return None
+        data_ids = stated_data_ids(job.settings, job.database, copy, profile)
+    except UnclearAttribute as error:
+        job.problems.append(
+            f"{where}: {error} Name the profile: {_profile_key(copy)}, "
+            "or leave the message out (dbc.messages)."
+        )
+        return None
+    before = len(job.problems)
+    if is_of_dbc:
+        job.problems += _length_problems(job, copy, where)
+    job.problems += _data_id_problems(copy, profile, data_ids, where)
+    if len(job.problems) > before:
+        return None
+    return Protection(profile, data_ids)
+
+
+def keys_of(copy: Copy, patterns: Sequence[str]) -> list[str]:
+    """Return the keys of [dbc.e2e] that apply to a message, the most specific one first."""
+    named = [name for name in (copy.name, copy.message.name) if name in patterns]
+    matching = [
+        pattern
+        for pattern in patterns
+        if fnmatch.fnmatchcase(copy.name, pattern)
+        or fnmatch.fnmatchcase(copy.message.name, pattern)
+    ]
+    return list(dict.fromkeys([*named, *matching]))
+
+
+def _profile_key(copy: Copy, name: str = "11C") -> str:
+    return f'dbc.e2e.{copy.name} = "{name}"'
+
+
+def stated_profile(
+    settings: DbcConfig,
+    database: "Database",
+    copy: Copy,
+) -> tuple[Profile | None, bool]:
+    """Return the profile, and True if it is from an attribute of the DBC."""
+    for key in keys_of(copy, tuple(settings.e2e)):
+        return PROFILES[settings.e2e[key]], False
+    profile = e2e_attributes.profile_of(copy.message, database)
+    if profile is not None:
+        return profile, True
+    return (_DEFAULT if copy.name in settings.e2e_data_ids else None), False
+
+
+def stated_data_ids(
+    settings: DbcConfig,
+    database: "Database",
+    copy: Copy,
+    profile: Profile,
+) -> tuple[int, ...]:
+    """Return the data ids of a message. Empty if they are not stated.
+
+    The DBC's data id is not used for copies for several ESCs, because a data id identifies one
+    message. The default of profile 1A is the CAN id.
+    """
+    configured = settings.e2e_data_ids.get(copy.name)
+    if configured is not None:
+        return (configured,) if isinstance(configured, int) else tuple(configured)
+    found = None if copy.prefix else e2e_attributes.data_ids_of(copy.message, database)
+    if found is not None:
+        return found
+    return can_id_as_data_id(copy) if profile.name == _DEFAULT.name else ()
+
+
+def can_id_as_data_id(copy: Copy) -> tuple[int, ...]:
+    return (copy.frame_id & 0xFFFF,)
+
+
+def _data_id_problems(
+    copy: Copy, profile: Profile, data_ids: Sequence[int], where: str
+) -> Iterator[str]:
+    key = f"dbc.e2e_data_ids.{copy.name}"
+    example = f"{key} = [1, 2, …]" if profile.ids > 1 else f"{key} = 0x123"
+    needed = f"{DATA_IDS} data ids, one for each counter" if profile.ids > 1 else "one data id"
+    if len(data_ids) != profile.ids:
+        found = f"has {len(data_ids)}" if data_ids else "has none"
+        yield f"{where}: E2E profile {profile.name} needs {needed}; it {found}. Set {example}."
+        return
+    for data_id in data_ids:
+        if data_id > profile.largest_id:
+            yield (
+                f"{where}: the data id 0x{data_id:X} is too large for E2E profile {profile.name}, "
+                f"at most 0x{profile.largest_id:X}. Set {example}."
+            )
+            return
+
+
+def _length_problems(job: Compilation, copy: Copy, where: str) -> Iterator[str]:
+    bits = e2e_attributes.protected_bits_of(copy.message, job.database)
+    if bits not in (None, copy.message.length * 8):
+        yield (
+            f"{where}: E2EDataLength is {bits} bits of {copy.message.length * 8}. Only a message "
+            f"that is protected as a whole can be sent. To confirm this, set {_profile_key(copy)}."
+        )
+
+
+def message_protection(
+    job: Compilation,
+    copy: Copy,
+    signals: Sequence[SignalPlan],
+    stated: Protection | None,
+) -> Protection | None:
+    """Return the protection of a compiled message. None if it has no CRC.
+
+    Adds lines to ``job.problems`` if its signals do not fit, and a warning if the profile is
+    assumed because of the signals' names.
+    """
+    where = f"{job.file}: {copy.message.name}"
+    crcs = [signal for signal in signals if signal.role is Role.CRC]
+    alive = [signal for signal in signals if signal.role is Role.ALIVE]
+    if len(crcs) > 1:
+        names = ", ".join(signal.name for signal in crcs)
+        job.problems.append(
+            f"{where}: has several CRC signals: {names}. Bind all but one to constants."
+        )
+    if not crcs and stated is not None and not _is_replaced(job, copy):
+        job.problems.append(
+            f"{where}: its E2EProfile needs a CRC, but no signal is known to be one. "
+            'Bind it: dbc.bind.SIGNAL = "crc".'
+        )
+    if len(crcs) != 1:
+        return None
+    job.protected.update(keys_of(copy, tuple(job.settings.e2e)))
+    (crc,) = crcs
+    found = stated
+    if found is None:
+        found = _assumed(job, copy, crc, alive)
+    if found is None:
+        job.problems.append(
+            f"{where}.{crc.name}: the DBC does not define how this checksum is computed. "
+            f"Name its AUTOSAR E2E profile ({', '.join(PROFILES)}): {_profile_key(copy, '2')}. "
+            f"Profile 1A is also chosen by {_data_id_key(copy)}. "
+            "Otherwise bind it to a constant, if receivers take "
+            "one, or leave the message out (dbc.messages)."
+        )
+        return None
+    job.problems += _fit_problems(found.profile, crc, alive, signals, where)
+    return found
+
+
+def _is_replaced(job: Compilation, copy: Copy) -> bool:
+    """Return True if the configuration explains why a message of a profile has no CRC.
+
+    It names the message itself, or it binds a signal to a constant.
+    """
+    settings = job.settings
+    if keys_of(copy, tuple(settings.e2e)) or copy.name in settings.e2e_data_ids:
+        return True
+    bound = [job.binder.bound(copy, signal.name) for signal in copy.message.signals]
+    return any(isinstance(each, (int, float)) for each in bound)
+
+
+def _data_id_key(copy: Copy) -> str:
+    return f"dbc.e2e_data_ids.{copy.name} = 0x{copy.frame_id & 0xFFFF:X}"
+
+
+def _assumed(
+    job: Compilation, copy: Copy, crc: SignalPlan, alive: Sequence[SignalPlan]
+) -> Protection | None:
+    """Return profile 1A for a CRC that is bound to "crc", or that has a well-known name."""
+    own = crc.name.removeprefix(copy.prefix)
+    protection = Protection(_DEFAULT, can_id_as_data_id(copy))
+    if job.binder.bound(copy, own) is not None:
+        return protection
+    if len(alive) != 1 or [*_fit_problems(_DEFAULT, crc, alive, (), "")]:
+        return None
+    counter = alive[0].name.removeprefix(copy.prefix)
+    if not is_e2e(own, str(job.binder.bound(copy, counter) or counter)):
+        return None
+    where = f"{job.file}: {copy.message.name}"
+    job.warnings.append(
+        f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. To confirm this, set "
+        f"{_data_id_key(copy)}"
+    )
+    return protection
+
+
+def _fit_problems(
+    profile: Profile,
+    crc: SignalPlan,
+    alive: Sequence[SignalPlan],
+    signals: Sequence[SignalPlan],
+    where: str,
+) -> Iterator[str]:
+    """Yield the problems of signals that do not fit the profile."""
+    title = f"E2E profile {profile.name}"
+    at = crc.pieces[0].at
+    is_whole = len(crc.pieces) == 1 and crc.length == profile.crc_bits and at % 8 == 0
+    if not is_whole:
+        order = "" if profile.crc_bits == 8 else ", the low byte first"
+        yield (
+            f"{where}.{crc.name}: an {title} CRC needs {profile.crc_bits} bits on a byte "
+            f"border{order}."
+        )
+        return
+    if profile.crc_byte is not None and at != profile.crc_byte * 8:
+        yield (
+            f"{where}.{crc.name}: an {title} CRC is in byte {profile.crc_byte}, not in byte "
+            f"{at // 8}. Profile 22 allows any byte."
+        )
+    most = profile.counters - 1
+    if len(alive) != 1 or alive[0].high < most:
+        yield (
+            f"{where}: {crc.name}: {title} needs exactly one alive counter, 0 to {most}, "
+            "in the message."
+        )
+    elif profile.counter_bits is not None:
+        (counter,) = alive
+        (piece, *others) = counter.pieces
+        wanted = at + profile.crc_bits
+        if others or counter.length != profile.counter_bits or piece.at != wanted:
+            last = profile.counter_bits - 1
+            yield (
+                f"{where}.{counter.name}: an {title} counter is in bits 0 to {last} of the byte "
+                f"after the CRC, here byte {wanted // 8}."
+            )
+    nibbles = [signal for signal in signals if signal.role is Role.DATA_ID]
+    if profile.mode is DataIdMode.NIBBLE and len(nibbles) != 1:
+        yield (
+            f"{where}: {title} sends 4 bits of the data id, but no signal is known to contain "
+            'them. Bind it: dbc.bind.SIGNAL = "data_id".'
+        )
+    for nibble in nibbles:
+        if nibble.length != 4 or nibble.page is not None or nibble.is_float:
+            yield f"{where}.{nibble.name}: has to be 4 bits of every frame, for {title}."
