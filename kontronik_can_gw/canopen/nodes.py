@@ -103,8 +103,17 @@ class Nodes(NodeOutput):
         if not self._is_on:
             self.start(now, can_open=True)
             return
-        self._can_faults.frames_pass(now)
+        self._can_faults.returned(now)
         self._finish(now)
+
+    def frames_discarded(self) -> None:
+        self._can_faults.frames_discarded()
+
+    def first_frame(self, _now: int) -> CanFrame | None:
+        if not self._is_on:
+            return None
+        frames = (node.heartbeat() for node in self.nodes)
+        return next((frame for frame in frames if frame is not None), None)
 
     def held_up(self, now: int) -> None:
         for node in self.nodes:
@@ -269,6 +278,9 @@ class _CanFaults:
         self._next_overrun_ns = 0
         self._was_off = False
         self._has_outage = False
+        self._is_unsent = False
+        """True if frames about the end of an outage were made, and are not known to be sent."""
+        self._unsent_was_off = False
 
     def power_on(self) -> None:
         """Forget faults from before the start."""
@@ -299,8 +311,22 @@ class _CanFaults:
                 node.repeat(now)
             if self._was_off:
                 node.emergencies.pulse(GatewayError.BUS_OFF_LEFT, now)
+        self._is_unsent = self._has_outage
+        self._unsent_was_off = self._was_off
         self._was_off = False
         self._has_outage = False
+
+    def returned(self, now: int) -> None:
+        """Follow an interface that sends frames again. Those that waited have not been lost."""
+        if self._has_outage or not self._is_unsent:
+            self.frames_pass(now)
+        self._is_unsent = False
+
+    def frames_discarded(self) -> None:
+        """Let the nodes boot again after the outage if their boot-ups were discarded."""
+        if self._is_unsent:
+            self._has_outage = True
+            self._was_off = self._was_off or self._unsent_was_off
 
     def overrun(self, now: int) -> None:
         """Report a loss of received frames in the controller, at most once a second."""

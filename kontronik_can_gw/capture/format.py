@@ -98,6 +98,12 @@ class EntryKind(IntEnum):
     """
     HELD_UP = 20
     """The process was delayed. flags 1: pending measurements were dropped."""
+    HOLD = 21
+    """No frame leaves the interface. Frames are held, and those of outputs were discarded."""
+    FIRST_FRAME = 22
+    """While frames are held, one frame without measurements was sent."""
+    RELEASE = 23
+    """That frame has left the interface, and the others are sent again."""
 
 
 _WITH_ARRIVAL = frozenset({EntryKind.BYTES, EntryKind.FRAME})

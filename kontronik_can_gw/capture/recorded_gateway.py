@@ -65,6 +65,21 @@ class RecordedGateway(Gateway):
         self._note(now, EntryKind.HELD_UP, flags=int(dropped))
         super().held_up(now, dropped)
 
+    def hold(self, now: int) -> None:
+        self._note(now, Kind.HOLD)
+        super().hold(now)
+
+    def first_frame(self, now: int) -> CanFrame | None:
+        self._note(now, Kind.FIRST_FRAME)
+        frame = super().first_frame(now)
+        if frame is not None:
+            self._counters = (self._counters[0] + 1, *self._counters[1:])
+        return frame
+
+    def release(self, now: int) -> None:
+        self._note(now, Kind.RELEASE)
+        super().release(now)
+
     def can_opened(self, now: int) -> None:
         self._note(now, EntryKind.CAN_OPENED)
         super().can_opened(now)
@@ -166,6 +181,7 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
     return {
         "escs": escs,
         "can_state": int(gateway.status.can_state),
+        "is_held": int(gateway.is_held),
         "started_ns": gateway.status.started_ns,
     }
 

@@ -119,6 +119,8 @@ class Replay:
         elif kind == EntryKind.START:
             self._start(now, bool(flags))
             self._collect_frames(now)
+        elif kind == EntryKind.FIRST_FRAME:
+            self._take_first_frame(now)
         elif kind == EntryKind.STOP:
             gateway.stop(now)
             self._collect_frames(now)
@@ -147,6 +149,12 @@ class Replay:
         if self._marked:
             self.gateway.status.state = GatewayState.REPLAY
 
+    def _take_first_frame(self, now: int) -> None:
+        frame = self.gateway.first_frame(now)
+        if frame is not None:
+            self.gateway.status.sent_frames += 1
+            self._taken = [TimedFrame(now, frame)]
+
     def _collect_frames(self, now: int) -> None:
         gateway = self.gateway
         gateway.take_saves()  # otherwise the list would grow
@@ -171,6 +179,8 @@ class Replay:
             self.gateway.status.started_ns = state["started_ns"]
         if "can_state" in state:
             self.gateway.status.can_state = CanState(state["can_state"])
+        if state.get("is_held"):
+            self.gateway.is_held = True
 
 
 def _repeat_rare(gateway: Gateway, entry: Entry) -> None:
@@ -186,6 +196,10 @@ def _repeat_rare(gateway: Gateway, entry: Entry) -> None:
             gateway.can_opened(now)
         case EntryKind.CAN_RETURNED:
             gateway.can_returned(now)
+        case EntryKind.HOLD:
+            gateway.hold(now)
+        case EntryKind.RELEASE:
+            gateway.release(now)
         case EntryKind.HELD_UP:
             gateway.held_up(now, bool(entry.flags))
         case EntryKind.CAN_STATE:

@@ -126,6 +126,13 @@ class Output:
     def can_returned(self, now: int) -> None:
         """Follow an interface that takes frames again after a loss, or for the first time."""
 
+    def frames_discarded(self) -> None:
+        """Follow an outage during which this output's waiting frames were discarded."""
+
+    def first_frame(self, now: int) -> CanFrame | None:  # noqa: ARG002  see DroneCAN
+        """Return a frame without measurements as the first one after an outage, or None."""
+        return None
+
     def held_up(self, now: int) -> None:
         """Follow a suspension of the process that ended at ``now``."""
 

@@ -229,6 +229,12 @@ class Dronecan(Output):
         if before is CanState.BUS_OFF and state not in (CanState.BUS_OFF, CanState.DOWN):
             self._log_again()
 
+    def first_frame(self, now: int) -> CanFrame | None:
+        for node in self._by_id.values():
+            status = self._status_of(node, now)
+            return node.message(wire.NODE_STATUS, status, priority=wire.LOWEST)[0]
+        return None
+
     def repeat_measurements(self, now: int) -> None:
         self._second_due = now
 

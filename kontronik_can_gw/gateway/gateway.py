@@ -11,6 +11,7 @@ from kontronik_can_gw.core.output import NodeOutput, NodeState
 from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway.first_frame import FirstFrame
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts
 from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.signals.plan import Layout
@@ -55,6 +56,9 @@ class Gateway:
             output.frames = self.output_frames
         self.core.followers = [Follower(each.events, each.on_event) for each in self.outputs]
         self.conflicts = IdConflicts(self.core.own_ids, self.outputs)
+        self.is_held = False
+        """True if no frame may be sent except the first one after an outage (``hold``)."""
+        self._first_frame = FirstFrame(layout, self.outputs)
         self._being_saved: list[tuple[int, NodeOutput]] = []
         self._has_discarded = False
         """True if measurements were discarded since the last ``advance``."""
@@ -133,10 +137,39 @@ class Gateway:
 
     def can_returned(self, now: int) -> None:
         """Send everything that has no cycle again, because frames were lost before."""
+        self._return(now)
+
+    def _return(self, now: int) -> None:
         self.core.expire(now)
         self.core.repeat(now)
         for output in self.outputs:
             output.can_returned(now)
+
+    # --- outages of the bus
+
+    def hold(self, now: int) -> None:  # noqa: ARG002  a recorded gateway needs it
+        """Send nothing until ``release``, and discard the outputs' waiting frames.
+
+        Messages and slots become pending as usual, and are packed with the values of the release. A
+        call while frames are held discards the outputs' new frames, so that answers do not get old.
+        """
+        self.is_held = True
+        if self.output_frames:
+            self.output_frames.clear()
+            for output in self.outputs:
+                output.frames_discarded()
+
+    def first_frame(self, now: int) -> CanFrame | None:
+        """Return a frame without measurements, to be sent while the others are held.
+
+        When it has left the interface, the bus works again. None if there is no such frame.
+        """
+        return self._first_frame.make(self.escs, self.status, now)
+
+    def release(self, now: int) -> None:
+        """Send frames again, with everything that has no cycle (``can_returned``)."""
+        self.is_held = False
+        self._return(now)
 
     def receive_overrun(self, now: int) -> None:
         """Follow a loss of received frames in the CAN controller."""
@@ -249,14 +282,16 @@ class Gateway:
     @property
     def frames_wait(self) -> bool:
         """True while ``take_frames`` has something to do."""
-        return bool(self.output_frames) or self.core.is_pending
+        return not self.is_held and (bool(self.output_frames) or self.core.is_pending)
 
     def take_frames(self, now: int) -> list[CanFrame]:
         """Return the frames to send, packed with current values.
 
         The outputs' own frames are first, oldest first. Then follow slots and messages, each in the
-        order in which they became due.
+        order in which they became due. While frames are held, there are none.
         """
+        if self.is_held:
+            return []
         frames = self.core.take(now)
         if self.output_frames:
             frames = self.output_frames + frames

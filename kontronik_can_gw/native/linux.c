@@ -2,13 +2,15 @@
 
    The twins in Python describe each rule: runtime/loop.py (Loop.turn), runtime/poller.py,
    runtime/ports (serial_port.py and esc_port.py: reading, and since when bytes can have arrived),
-   gateway/transmit_queue.py (frames that wait) and runtime/can/socketcan_port.py (sending).
+   gateway/transmit_queue.py (frames that wait), gateway/departures.py (a blocked bus) and
+   runtime/can/socketcan_port.py (sending).
 
    In this file "the loop" is the loop in Python. It does everything that these turns do not do: its
    next turn follows at once with all that is ready. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <poll.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
 #include <sys/ioctl.h>
@@ -25,7 +27,9 @@
 #define CHECK_EACH (100 * MS)  /* Between checks of settings: an echo would send to the ESC. */
 enum {
     CLASSIC_SIZE = 16, /* Size of struct can_frame. */
-    FD_SIZE = 72       /* Size of struct canfd_frame. */
+    FD_SIZE = 72,      /* Size of struct canfd_frame. */
+    CHECKS = 3,        /* As in gateway/departures.py. */
+    MAX_DIGITS = 32    /* Bytes that are read of a number in /sys. */
 };
 
 static int64_t now_ns(void)
@@ -98,6 +102,38 @@ static int serve(kcg_turns *t)
     return 1;
 }
 
+/* Returns how many frames have left the interface, or 0 if that is not known. */
+static int64_t frames_left(const kcg_turns *t)
+{
+    char digits[MAX_DIGITS + 1] = "";
+    ssize_t size = t->request.count_fd < 0 ? -1 : pread(t->request.count_fd, digits, MAX_DIGITS, 0);
+    return size > 0 ? strtoll(digits, NULL, 10) : 0;
+}
+
+/* Checks whether frames have left the interface, if the check is due. Returns 1 if it is blocked.
+   The loop then checks again, and holds the frames. */
+static int is_blocked(kcg_turns *t)
+{
+    kcg_departures *d = &t->departures;
+    int64_t now = t->times.now;
+    if (now < d->check_due)
+        return 0;
+    int64_t count = frames_left(t);
+    int has_left = count != d->count;
+    d->waiting -= count - d->count;
+    d->waiting = d->waiting > 0 ? d->waiting : 0;
+    d->count = count;
+    if (!has_left && count && now - d->waits_since >= CHECKS * t->request.check_period) {
+        d->check_due = now;
+        return 1;
+    }
+    if (has_left)
+        d->waits_since = d->waiting ? now : KCG_DRAINED;
+    int is_empty = d->waits_since == KCG_DRAINED;
+    d->check_due = is_empty ? KCG_DRAINED : now + t->request.check_period;
+    return 0;
+}
+
 /* Gives `count` frames to the kernel, with `page` 0 (see kcg_frame). Returns the number that it
    took, or -1 with errno. */
 static int send_frames(int bus, kcg_frame *frame, uint32_t count)
@@ -138,6 +174,11 @@ static int hand_over(kcg_turns *t)
             sent += (uint32_t)result;
     }
     t->core->gateway[KCG_SENT_FRAMES] += sent;
+    t->departures.waiting += sent;
+    if (sent && t->departures.waits_since == KCG_DRAINED) {
+        t->departures.waits_since = t->times.now;
+        t->departures.check_due = t->times.now + t->request.check_period;
+    }
     q->count -= sent;
     q->from_outputs -= sent < q->from_outputs ? sent : q->from_outputs;
     memmove(q->frame, q->frame + sent, q->count * sizeof *q->frame);
@@ -390,6 +431,8 @@ static int turn(kcg_turns *t)
         if (!serve(t))
             return 0;
     if (*event < 0 && !r->has_advanced) {
+        if (is_blocked(t))
+            return 0;
         if (is_idle(t))
             return may_wait(t);
         note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);

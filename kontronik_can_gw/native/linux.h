@@ -49,8 +49,11 @@ typedef struct {
     int64_t period;       /* Longest time between two polls of all descriptors. */
     int64_t max_late;     /* Return if a turn is later than this: the process was held up. */
     int64_t max_turn;     /* Do not send frames whose turn has lasted longer than this. */
+    int64_t check_period; /* Time between two checks of `departures`. */
     int32_t bus;          /* Socket of the CAN interface. */
+    int32_t count_fd;     /* File with the interface's number of sent frames, or -1. */
     uint32_t is_recorded; /* 1: record each call of the core in `ring`. */
+    uint32_t reserved;
 } kcg_turn_request;
 
 /* Times in ns. The owner writes the first three before kcg_begin and reads them after a run. */
@@ -92,6 +95,10 @@ typedef struct {
     kcg_frame made[KCG_MADE]; /* Frames that were just taken from the core. */
 } kcg_turn_queue;
 
+/* Frames that the interface has accepted (twin: gateway/departures.py, which describes the fields).
+   NEVER is KCG_DRAINED. The owner writes them before kcg_begin and reads them after a run. */
+typedef struct { int64_t count, waits_since, check_due, waiting; } kcg_departures;
+
 /* The descriptors that are watched. */
 typedef struct {
     int32_t epoll;
@@ -108,6 +115,7 @@ typedef struct {
     kcg_turn_result result;
     kcg_turn_reads reads;
     kcg_turn_queue queue;
+    kcg_departures departures;
     kcg_turn_ports ports;
     uint8_t ring[KCG_RING]; /* Recorded calls: kcg_entry and data, one after the other. */
 } kcg_turns;

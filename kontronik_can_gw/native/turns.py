@@ -46,6 +46,7 @@ class Turns:
         self.request: Any = self._state.request
         self.times: Any = self._state.times
         self.result: Any = self._state.result
+        self.departures: Any = self._state.departures
         self._reads: Any = self._state.reads
         self._queue: Any = self._state.queue
         self._ports: Any = self._state.ports

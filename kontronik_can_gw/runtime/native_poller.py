@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native.turns import OUTPUTS
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
     from kontronik_can_gw.native.core import NativeCore
     from kontronik_can_gw.runtime.can.can_link import CanLink
+    from kontronik_can_gw.runtime.can.can_port import CanPort
+    from kontronik_can_gw.runtime.can.transmitter import Transmitter
 
 
 def poller_for(gateway: Gateway) -> Poller:
@@ -83,21 +85,24 @@ class NativePoller(Poller):
         longest duration of a wait. All are in ns.
         """
         gateway = self._gateway
-        if self._core.reports_live or gateway.frames_wait:
+        if self._core.reports_live or gateway.frames_wait or gateway.is_held:
             return None
-        bus = _plain_socket(can, gateway)
-        if bus is None or not self._watches():
+        port = _plain_port(can, gateway)
+        if port is None or not self._watches():
             return None
         turns = self._turns
         request, times, result = turns.request, turns.times, turns.result
         times.now = last
         times.polled = self.now
         times.bus_empty = self.before
-        request.bus = bus
+        request.bus = port.fileno()
+        request.count_fd = port.count_fd
+        departures = can.transmitter.departures
+        _copy_departures(departures, turns.departures)
         request.leave = leave
         request.due = min(due, self._core.deadline_in_python())
         request.outputs_due = gateway.next_deadline(with_core=False)
-        self._set_limits(period, can.transmitter.max_turn_ns())
+        self._set_limits(period, can.transmitter)
         recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
         if recorded is not None:
             recorded.prepare_turns(last)
@@ -109,6 +114,7 @@ class NativePoller(Poller):
                     self._core.receive(*turns.read())
                 turns.leave()
                 break
+        _copy_departures(turns.departures, departures)
         self.count += result.turns
         self.before = times.bus_empty
         self.now = times.polled
@@ -122,9 +128,11 @@ class NativePoller(Poller):
             self._finish(can, times.now)
         return self.handlers(turns.ready()) if result.happened else []
 
-    def _set_limits(self, period_ns: int, max_turn_ns: int) -> None:
+    def _set_limits(self, period_ns: int, transmitter: "Transmitter") -> None:
         request = self._turns.request
+        max_turn_ns = transmitter.max_turn_ns()
         request.period = period_ns
+        request.check_period = transmitter.check_period_ns
         request.max_turn = max_turn_ns
         request.max_late = max(MIN_HELD_UP_NS, max_turn_ns)
 
@@ -167,10 +175,18 @@ class NativePoller(Poller):
         return self._fits
 
 
-def _plain_socket(can: "CanLink", gateway: Gateway) -> int | None:
-    """Return the interface's socket if C can hand frames to it now, otherwise None."""
+def _copy_departures(source: Any, target: Any) -> None:
+    """Copy the fields that ``Departures`` and kcg_departures share."""
+    target.count = source.count
+    target.waits_since = source.waits_since
+    target.check_due = source.check_due
+    target.waiting = source.waiting
+
+
+def _plain_port(can: "CanLink", gateway: Gateway) -> "CanPort | None":
+    """Return the interface if C can hand frames to its socket now, otherwise None."""
     port = can.port
     is_plain = can.is_proven and can.transmitter.is_idle and not can.controller.is_off
     if port is None or port.gone or not is_plain or port.state is not gateway.status.can_state:
         return None
-    return port.fileno() if port.is_socket else None
+    return port if port.is_socket else None

@@ -32,6 +32,7 @@ _CALLS = (
     "epoll_wait",
     "close",
     "poll",
+    "pread",
     "read",
     "ioctl",
 )
@@ -55,6 +56,7 @@ class _Kernel(c.Structure):
         ("ready", c.CFUNCTYPE(c.c_int, c.c_int)),
         ("size", c.CFUNCTYPE(c.c_int, c.c_int, c.c_int)),
         ("send", c.CFUNCTYPE(c.c_int, c.POINTER(c.c_uint8), c.c_int)),
+        ("left", c.CFUNCTYPE(c.c_int64)),
         ("settings", c.CFUNCTYPE(None, c.c_int, c.POINTER(c.c_uint8), c.c_int)),
     )
 
@@ -84,6 +86,7 @@ class FakeNativePoller(NativePoller):
             world.ready,
             self._read,
             self._send,
+            lambda: world.bus.frames_left(),
             self._settings,
         ]
         pairs = zip(kinds, calls, strict=True)

@@ -541,12 +541,18 @@ def test_frames_discarded_in_an_outage_are_reported_to_the_recorder(
     """Otherwise a replay would contain them."""
     bench.begin()
     told_at: list[int] = []
-    monkeypatch.setattr(bench.gateway, "not_sent", told_at.append)
+    hold = bench.gateway.hold
+
+    def noted(now: int) -> None:
+        told_at.append(now)
+        hold(now)
+
+    monkeypatch.setattr(bench.gateway, "hold", noted)
     bench.turn(100)
     assert told_at == []
     bench.changes(LinkFacts(exists=False), there=False)
-    bench.turn(1000)
-    assert len(told_at) > 10
+    bench.turn(5000)
+    assert len(told_at) > 5, "a heartbeat a second"
     bench.changes(ACTIVE)
     bench.turn(100)
     told_at.clear()

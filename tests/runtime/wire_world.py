@@ -34,7 +34,7 @@ from kontronik_can_gw.runtime.ports.usb_adapters import Identity
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import CanState
-from kontronik_can_gw.times import MS, SECOND
+from kontronik_can_gw.times import MS, NEVER, SECOND
 
 NS_PER_BYTE = KONTRONIK.byte_ns
 
@@ -192,8 +192,14 @@ class Bus(CanPort):
         """Times at which a frame was refused with ``answer``. A refusal takes 0.1 ms."""
         self.frame_ns = 0
         """Duration of a frame on the bus. Unless it is 0, the kernel buffers six frames."""
-        self._out: list[int] = []
-        """Times at which the frames in the kernel will have been sent."""
+        self.arrived: list[tuple[int, CanFrame]] = []
+        """The frames that have left the interface, with their times, if ``frame_ns`` is not 0."""
+        self.count_fd = CAN_FD + 1
+        self._out: list[tuple[int, CanFrame]] = []
+        """The frames in the kernel, and the times at which they will have been sent."""
+        self._is_blocked = False
+        self._count = 1
+        """Number of frames that have left the interface."""
         self.on_send: Callable[[CanFrame], None] = lambda _frame: None
         self._world = world
 
@@ -231,7 +237,43 @@ class Bus(CanPort):
     @property
     def room_at(self) -> int:
         """The time at which the socket becomes writable: its buffer is less than half full."""
-        return self._out[-3] if len(self._out) > 2 else 0
+        return self._out[-3][0] if len(self._out) > 2 else 0
+
+    def frames_left(self) -> int:
+        self._pass_time()
+        return self._count
+
+    def block(self) -> None:
+        """Let no frame leave the interface until ``free`` is called. ``frame_ns`` must be set."""
+        self._pass_time()
+        self._is_blocked = True
+        self._out = [(NEVER, frame) for _, frame in self._out]
+
+    def free(self) -> None:
+        """Let frames leave the interface again, first those in the kernel."""
+        self._is_blocked = False
+        frames = [frame for _, frame in self._out]
+        self._out = []
+        for frame in frames:
+            self._add(frame)
+
+    def discard_waiting(self) -> None:
+        """Discard the frames in the kernel, as setting the interface down does."""
+        self._pass_time()
+        self._out.clear()
+
+    def _add(self, frame: CanFrame) -> None:
+        begin = max([self._world.now, *[at for at, _ in self._out[-1:]]])
+        at = NEVER if self._is_blocked else begin + self.frame_ns
+        self._out.append((at, frame))
+
+    def _pass_time(self) -> None:
+        """Move the frames that have been sent by now to ``arrived``."""
+        now = self._world.now
+        sent = [each for each in self._out if each[0] <= now]
+        self.arrived += sent
+        self._count += len(sent)
+        self._out = self._out[len(sent) :]
 
     def _send_each(
         self,
@@ -243,15 +285,15 @@ class Bus(CanPort):
             if clock() > latest:
                 return count, Sent.LATE
             if self.frame_ns:
-                self._out = [at for at in self._out if at > self._world.now]
+                self._pass_time()
                 if len(self._out) == 6:
                     return count, Sent.FULL
-                begin = max([self._world.now, *self._out[-1:]])
-                self._out.append(begin + self.frame_ns)
+                self._add(frame)
             if self.answer is not Sent.OK:
                 self.refused.append(self._world.now)
                 self._world.now += MS // 10
                 return count, self.answer
+            self._count += not self.frame_ns
             self.sent.append((self._world.now, frame))
             self.on_send(frame)
         return len(frames), Sent.OK

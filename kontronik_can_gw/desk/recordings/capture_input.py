@@ -182,7 +182,7 @@ class CaptureInput(PlayedInput):
                 # waiting frames may still be dropped by an entry that the player does not play
                 if in_python or (replay.frames_wait and kind not in _PLAYED):
                     if kind != EntryKind.NOT_SENT:
-                        in_python = kind != EntryKind.ADVANCE
+                        in_python = kind != EntryKind.ADVANCE or replay.gateway.is_held
                     entry = entry_at(payload, *player.skip())
                     checked = self._checked(entry)
                     if checked is not None:

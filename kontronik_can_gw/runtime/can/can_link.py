@@ -67,7 +67,7 @@ class CanLink:
         self._receive_ids: frozenset[int] | None = None
         """The ids that the open port receives."""
         self.is_proven = False
-        """True if the interface has accepted a frame since its last failure."""
+        """True if the interface has sent a frame since its last failure."""
         self._drained = True
         self._noted = PortInput()
         self._stuck = StuckCheck(self._noted)
@@ -118,8 +118,7 @@ class CanLink:
         if self._retry.due is None or now < self._retry.due or self.port is not None:
             return
         try:
-            if self._open(now):
-                self._gateway.can_returned(max(now, self._clock()))  # opening may take long
+            self._open(now)
         except RunError as error:
             self._failed(str(error), now)
 
@@ -130,7 +129,6 @@ class CanLink:
             self._opening_since = None
         if isinstance(result, CanPort):
             self._use(result, now)
-            self._gateway.can_returned(now)
         elif result is not None:
             if self.must_open:
                 raise result
@@ -176,7 +174,7 @@ class CanLink:
         """Use an open port."""
         self.port = port
         self._retry.due = None
-        self.transmitter.forget_failures()
+        self.transmitter.use(port)
         self.controller.is_off = False
         self._stuck = StuckCheck(self._noted)
         fd = port.fileno()
@@ -284,25 +282,19 @@ class CanLink:
     def transmit(self, now: int) -> None:
         """Hand the due frames to the interface until it refuses one.
 
-        In bus-off no frame is handed over, because it would be lost, or sent late after the
-        restart.
+        In bus-off frames are held, because they would be lost, or sent late after the restart.
         """
-        frames = self._gateway.take_frames(now)
         port = self.port
         transmitter = self.transmitter
-        if frames:
-            transmitter.put(frames)
         if port is None or self.controller.is_off:
-            if frames:
-                self._gateway.not_sent(now)
-            transmitter.clear()
+            transmitter.hold(now)
             transmitter.forget_failures()
             return
         answer = transmitter.transmit(port, now)
         if answer is None:
             return
         if answer is _OK:
-            if not self.is_proven:
+            if not self.is_proven and not self._gateway.is_held:
                 self._prove(now)
         elif answer is Sent.FULL:
             self._watch(select.POLLIN | select.POLLOUT)
@@ -317,7 +309,7 @@ class CanLink:
             self._poller.register(fd, self.serve, events)
 
     def _prove(self, now: int) -> None:
-        """End the fault of the interface, because it has accepted a frame."""
+        """End the fault of the interface, because it sends frames."""
         self.is_proven = True
         self._retry.succeeded()
         text = f"CAN {self.config.channel}: frames are sent again"

@@ -54,6 +54,8 @@ class CanPort(ABC):
         """
         self.drained = True
         """True if the last ``receive`` left no frame, including frames that it does not return."""
+        self.count_fd = -1
+        """Descriptor of the file with the number of ``frames_left``, or -1 if there is none."""
         self._ids: frozenset[int] = frozenset()
         self._blocks: tuple[int, ...] = ()
         self._known_drops = 0
@@ -95,6 +97,13 @@ class CanPort(ABC):
 
         Error frames are not returned. They update the state of the controller.
         """
+
+    def frames_left(self) -> int:
+        """Return how many frames have left the interface, including those of other programs.
+
+        0 if the number is not known.
+        """
+        return 0
 
     def discard(self) -> None:
         """Discard the data frames that have not been received yet.

@@ -66,6 +66,8 @@ _SO_TIMESTAMPNS = 64
 """Requests times of reception. Kernels before 5.1 do not have it: the time of the read is used."""
 _TIME = struct.Struct("=qq")
 _ANCILLARY_SIZE = 64
+_MAX_DIGITS = 32
+"""Bytes that are read of a number in /sys."""
 _SO_MEMINFO = 55
 """Requests the kernel's figures of a socket. The last one counts frames dropped by a full queue."""
 _MEMINFO = struct.Struct("=9I")
@@ -76,9 +78,11 @@ class SocketCanPort(CanPort):
 
     is_socket = True
 
-    def __init__(self, opened: socket.socket) -> None:
+    def __init__(self, opened: socket.socket, count_fd: int = -1) -> None:
+        """Use a bound socket. ``count_fd``, unless it is -1, is closed with it."""
         super().__init__()
         self._socket = opened
+        self.count_fd = count_fd
         # Until ``set_receive_ids`` is called, only error frames wake the process.
         opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
         opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 0)
@@ -93,6 +97,17 @@ class SocketCanPort(CanPort):
 
     def close(self) -> None:
         self._socket.close()
+        if self.count_fd >= 0:
+            os.close(self.count_fd)
+            self.count_fd = -1
+
+    def frames_left(self) -> int:
+        if self.count_fd < 0:
+            return 0
+        try:
+            return int(os.pread(self.count_fd, _MAX_DIGITS, 0))
+        except (OSError, ValueError):  # the interface was removed
+            return 0
 
     def _filter(self) -> None:
         packed = b"".join(_FILTER.pack(*each) for each in kernel_filters(self._ids))
@@ -280,13 +295,21 @@ def open_socketcan(config: CanConfig) -> SocketCanPort:
                 opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
             opened.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, MAX_EXTENDED_ID)
             opened.bind((name,))
-            port = SocketCanPort(opened)
+            port = SocketCanPort(opened, _open_count(name))
             undone.pop_all()
             return port
     except OSError as error:
         raise socketcan_error(config, error.errno or 0, error.strerror or str(error)) from None
     except AttributeError:  # this Python was built without SocketCAN
         raise socketcan_error(config, errno.EAFNOSUPPORT) from None
+
+
+def _open_count(name: str) -> int:
+    """Open the file with an interface's number of sent frames. Returns -1 if there is none."""
+    try:
+        return os.open(f"/sys/class/net/{name}/statistics/tx_packets", os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return -1
 
 
 def socketcan_error(config: CanConfig, number: int, text: str = "") -> RunError:
