@@ -66,18 +66,18 @@ class RecordedGateway(Gateway):
         super().held_up(now, dropped)
 
     def hold(self, now: int) -> None:
-        self._note(now, Kind.HOLD)
+        self._note(now, EntryKind.HOLD)
         super().hold(now)
 
     def first_frame(self, now: int) -> CanFrame | None:
-        self._note(now, Kind.FIRST_FRAME)
+        self._note(now, EntryKind.FIRST_FRAME)
         frame = super().first_frame(now)
         if frame is not None:
             self._counters = (self._counters[0] + 1, *self._counters[1:])
         return frame
 
     def release(self, now: int) -> None:
-        self._note(now, Kind.RELEASE)
+        self._note(now, EntryKind.RELEASE)
         super().release(now)
 
     def can_opened(self, now: int) -> None:

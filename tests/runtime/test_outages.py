@@ -13,7 +13,7 @@ from wire_world import NOT_AVAILABLE, TIMES, World, layout_of, loop_in, run, spe
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
-from kontronik_can_gw.capture.format import Entry, Kind
+from kontronik_can_gw.capture.format import Entry, EntryKind
 from kontronik_can_gw.capture.recorded_gateway import RecordedGateway, state_of
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.config.output_keys import DronecanConfig
@@ -82,7 +82,7 @@ class Recorded:
     def _put(
         self, now: int, kind: int, esc: int, data: bytes, flags: int, came: int | None = None
     ) -> None:
-        self.entries.append(Entry(now, Kind(kind), esc, data, flags, came))
+        self.entries.append(Entry(now, EntryKind(kind), esc, data, flags, came))
 
     def run(self, ns: int) -> None:
         """Run for a time in which the ESC sends a frame each 10 ms."""
@@ -138,7 +138,7 @@ def test_after_a_blocked_bus_only_the_frames_in_the_kernel_are_late(
         assert all(n < HELD for n in late), "these were in the kernel"
         assert any(age is not None for age in ages[HELD:]), "values are sent again"
         entries = it.entries[number:]
-        held = next(each.time_ns for each in entries if each.kind == Kind.HOLD)
+        held = next(each.time_ns for each in entries if each.kind == EntryKind.HOLD)
         assert held <= blocked + 1.1 * TIMEOUT
         handed = [each for each in it.bus.sent if each[0] >= held]
         assert handed[0][1].can_id == STATUS
