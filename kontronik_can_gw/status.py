@@ -61,6 +61,8 @@ class GatewayStatus:
     """Frames in a fixed order that were lost: too many waited, or the interface was down."""
     id_conflicts: int = 0
     """Received frames with an id that only this gateway may use."""
+    can_restarts: int = 0
+    """Restarts of the CAN interface that were requested because no frame left it."""
 
     def frozen(self) -> "GatewayStatus":
         """Return a copy, which other threads may read."""

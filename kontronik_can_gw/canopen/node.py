@@ -305,12 +305,6 @@ class Node:
     def _send_sdo(self, data: bytes) -> None:
         self._send(SDO_ANSWER + self.node_id, data)
 
-    def heartbeat(self) -> CanFrame | None:
-        """Return a heartbeat with the present state. None without a node-ID."""
-        if self.node_id == UNCONFIGURED:
-            return None
-        return CanFrame(HEARTBEAT + self.node_id, bytes([self.state]), queued=True)
-
     def _send_heartbeat(self) -> None:
         self._send(HEARTBEAT + self.node_id, bytes([self.state]))
 

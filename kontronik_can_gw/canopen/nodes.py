@@ -99,21 +99,20 @@ class Nodes(NodeOutput):
         self._can_faults.on_state(state, now)
         self._finish(now)
 
-    def can_returned(self, now: int) -> None:
+    def can_returned(self, now: int, has_lost_frames: bool = False) -> None:
         if not self._is_on:
             self.start(now, can_open=True)
             return
-        self._can_faults.returned(now)
+        self._can_faults.returned(now, has_lost_frames)
         self._finish(now)
-
-    def frames_discarded(self) -> None:
-        self._can_faults.frames_discarded()
 
     def first_frame(self, _now: int) -> CanFrame | None:
         if not self._is_on:
             return None
-        frames = (node.heartbeat() for node in self.nodes)
-        return next((frame for frame in frames if frame is not None), None)
+        for node in self.nodes:
+            if node.node_id != UNCONFIGURED:
+                return CanFrame(HEARTBEAT + node.node_id, bytes([node.state]))
+        return None
 
     def held_up(self, now: int) -> None:
         for node in self.nodes:
@@ -246,7 +245,11 @@ class Nodes(NodeOutput):
             self._route(frame, now, now)
         if self._has_changed and self._is_on:
             self._has_changed = False
-            self._make_routes()
+            self._routes = _routes(self.nodes)
+            self._watched = frozenset(
+                HEARTBEAT + node_id for node in self.nodes for node_id in node.consumer.node_ids
+            )
+            self.receive_ids = frozenset(self._routes)
         for node in self.nodes:
             node.set_due()
         self.due = min([node.due for node in self.nodes])
@@ -255,15 +258,14 @@ class Nodes(NodeOutput):
         for take in self._routes.get(frame.can_id, ()):
             take(frame.data, now, at)
 
-    def _make_routes(self) -> None:
-        self._watched = frozenset(
-            HEARTBEAT + node_id for node in self.nodes for node_id in node.consumer.node_ids
-        )
-        self._routes = {}
-        for node in self.nodes:
-            for cob_id, take in node.routes():
-                self._routes.setdefault(cob_id, []).append(take)
-        self.receive_ids = frozenset(self._routes)
+
+def _routes(nodes: Sequence[Node]) -> dict[int, list[FrameTaker]]:
+    """Return the functions that take received frames, by COB-ID."""
+    routes: dict[int, list[FrameTaker]] = {}
+    for node in nodes:
+        for cob_id, take in node.routes():
+            routes.setdefault(cob_id, []).append(take)
+    return routes
 
 
 class _CanFaults:
@@ -316,17 +318,14 @@ class _CanFaults:
         self._was_off = False
         self._has_outage = False
 
-    def returned(self, now: int) -> None:
-        """Follow an interface that sends frames again. Those that waited have not been lost."""
+    def returned(self, now: int, has_lost_frames: bool) -> None:
+        """Follow an interface that sends frames again. Boot-ups that were discarded are repeated."""
+        if self._is_unsent and has_lost_frames:
+            self._has_outage = True
+            self._was_off = self._was_off or self._unsent_was_off
         if self._has_outage or not self._is_unsent:
             self.frames_pass(now)
         self._is_unsent = False
-
-    def frames_discarded(self) -> None:
-        """Let the nodes boot again after the outage if their boot-ups were discarded."""
-        if self._is_unsent:
-            self._has_outage = True
-            self._was_off = self._was_off or self._unsent_was_off
 
     def overrun(self, now: int) -> None:
         """Report a loss of received frames in the controller, at most once a second."""

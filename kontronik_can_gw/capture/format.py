@@ -259,8 +259,12 @@ COUNTERS = (
     "dropped_frames",
     "id_conflicts",
     "started_ns",
+    "can_restarts",
 )
-"""Attributes of GatewayStatus in a COUNTERS entry, in its order."""
+"""Attributes of GatewayStatus in a COUNTERS entry, in its order.
+
+The last one is missing in captures of version 0.5.
+"""
 
 
 def numbers_data(*numbers: int) -> bytes:

@@ -127,7 +127,7 @@ class Replay:
         elif kind == EntryKind.COUNTERS:
             counters = read_numbers(data)
             check_counters(counters)
-            for name, value in zip(COUNTERS, counters, strict=True):
+            for name, value in zip(COUNTERS, counters, strict=False):
                 setattr(gateway.status, name, value)
         elif kind == EntryKind.LINE_ERRORS:
             (gateway.escs[esc].line_errors,) = read_numbers(data)

@@ -27,6 +27,8 @@ PLAIN = Path(__file__).parents[1] / "systemd"
 """The folder of the original files."""
 _PROGRAM = f"/usr/bin/{NAME}"
 """The path of the program in the original units."""
+_RESTART = f"{NAME}-restart"
+"""The units that restart a CAN interface, whose instances are named after it."""
 _KINDS = ("", "-mqtt", "-metrics")
 """Suffixes of the services: the gateway's, and two optional ones."""
 UNITS = "etc/systemd/system"
@@ -129,6 +131,9 @@ def planned(program: str) -> Iterator[tuple[str, str]]:
         template = text.replace("/gateway.toml", "/%i.toml")
         template = re.sub(r"(?m)^(StateDirectory|RuntimeDirectory)=.*", r"\g<0>-%i", template)
         yield f"{UNITS}/{NAME}{kind}@.service", template
+    for suffix in ("path", "service"):
+        name = f"{_RESTART}@.{suffix}"
+        yield f"{UNITS}/{name}", _plain(name)
     yield f"etc/sysusers.d/{NAME}.conf", _plain("sysusers.conf")
     yield f"etc/tmpfiles.d/{NAME}.conf", _plain("tmpfiles.conf")
     yield f"etc/udev/rules.d/70-{NAME}.rules", _plain("udev.rules")
@@ -166,12 +171,15 @@ def _install(args: argparse.Namespace, root: Path) -> None:
     unit = template.replace("@", f"@{args.instance}")
     lines = _not_ready(root / config)
     is_ready = not lines
-    if is_ready:  # the following is the effect of `systemctl enable`
-        link = root / _WANTS / unit
-        link.parent.mkdir(parents=True, exist_ok=True)
-        link.unlink(missing_ok=True)
-        link.symlink_to(f"/{UNITS}/{template}")
+    restarted = ""
+    if is_ready:
+        _enable(root, unit, template)
         lines = [f"{unit} is enabled. See: systemctl status {unit}"]
+        can = load(root / config).can
+        if can.restart_after_s and can.interface == "socketcan":
+            restarted = f"{_RESTART}@{can.channel}.path"
+            _enable(root, restarted, f"{_RESTART}@.path")
+            lines.append(f"{restarted} is enabled, because can.restart_after_s is not 0")
     else:
         lines.append(
             f"{unit} was not enabled. After the correction: sudo systemctl enable --now {unit}"
@@ -182,8 +190,18 @@ def _install(args: argparse.Namespace, root: Path) -> None:
         raise RunError(*lines)
     if args.now and args.root is None:
         _call("systemctl", "restart", unit)
+        if restarted:
+            _call("systemctl", "restart", restarted)
     for line in lines:
         say(line)
+
+
+def _enable(root: Path, unit: str, template: str) -> None:
+    """Enable a unit, as `systemctl enable` does."""
+    link = root / _WANTS / unit
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.unlink(missing_ok=True)
+    link.symlink_to(f"/{UNITS}/{template}")
 
 
 def _put(path: Path, text: str) -> None:
@@ -278,13 +296,13 @@ def _uninstall(root: Path, *, staged: bool) -> None:
     """Stop, disable and remove the services. Configurations, parameters and the user are kept."""
     if not staged:
         for verb in ("stop", "reset-failed"):
-            _call("systemctl", verb, f"{NAME}*.service")
-    found = [path for path in (root / _WANTS).glob(f"{NAME}*.service") if path.is_symlink()]
+            _call("systemctl", verb, f"{NAME}*.path", f"{NAME}*.service")
+    found = [path for path in (root / _WANTS).glob(f"{NAME}*") if path.is_symlink()]
     found += _obsolete_files(root)
     for place, text in planned(""):
         path = root / place
         there = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else text
-        if re.sub(r"(?m)^ExecStart=\S*", "ExecStart=", there) != text:
+        if _without_program(there) != _without_program(text):
             say(f"{path}: was changed, kept as {_set_aside(path)}")
         elif os.path.lexists(path):
             found.append(path)
@@ -300,6 +318,11 @@ def _uninstall(root: Path, *, staged: bool) -> None:
         )
     else:
         say("nothing is installed")
+
+
+def _without_program(unit: str) -> str:
+    """Return the text of a unit without the program that it starts."""
+    return re.sub(r"(?m)^ExecStart=\S*", "ExecStart=", unit)
 
 
 # --- tools

@@ -104,16 +104,17 @@ def integer_or_list(low: int, high: int, length: int) -> KeyKind:
     return KeyKind(f"{one.span}, or lists of {length}", {"anyOf": [one.schema, numbers]}, check)
 
 
-def number(low: float, high: float) -> KeyKind:
-    """Accept a number from ``low`` to ``high``."""
+def number(low: float, high: float, or_zero: bool = False) -> KeyKind:
+    """Accept a number from ``low`` to ``high``, with ``or_zero`` also 0."""
+    schema: dict[str, Any] = {"type": "number", "minimum": low, "maximum": high}
+    span = f"{low} … {high}"
     problem = f"is outside {low}..{high}"
-    return _plain(
-        f"{low} … {high}",
-        problem,
-        type="number",
-        minimum=low,
-        maximum=high,
-    )
+    if or_zero:
+        schema["minimum"] = 0
+        schema["not"] = {"exclusiveMinimum": 0, "exclusiveMaximum": low}
+        span = f"0, {span}"
+        problem = f"{problem} and not 0"
+    return _plain(span, problem, **schema)
 
 
 def pattern(

@@ -123,11 +123,11 @@ class Output:
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
         """Follow the state of the CAN controller. DOWN may be followed by DOWN."""
 
-    def can_returned(self, now: int) -> None:
-        """Follow an interface that takes frames again after a loss, or for the first time."""
+    def can_returned(self, now: int, has_lost_frames: bool = False) -> None:
+        """Follow an interface that takes frames again after a loss, or for the first time.
 
-    def frames_discarded(self) -> None:
-        """Follow an outage during which this output's waiting frames were discarded."""
+        ``has_lost_frames`` is True if frames that outputs made during the outage were discarded.
+        """
 
     def first_frame(self, now: int) -> CanFrame | None:  # noqa: ARG002  see DroneCAN
         """Return a frame without measurements as the first one after an outage, or None."""

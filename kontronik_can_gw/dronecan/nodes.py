@@ -221,7 +221,7 @@ class Dronecan(Output):
         for node in self._by_id.values():
             self._send_node_status(node, now, wire.OFFLINE)
 
-    def can_returned(self, now: int) -> None:
+    def can_returned(self, now: int, has_lost_frames: bool = False) -> None:
         self._log_again()
         self.repeat_measurements(now)
 

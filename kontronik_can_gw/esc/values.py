@@ -404,6 +404,7 @@ def _make_gateway_values() -> Iterator[Value]:
         "bus_off_count",
         "dropped_frames",
         "id_conflicts",
+        "can_restarts",
     ):
         yield _gateway_value(name, rolls=True)
 

@@ -11,15 +11,15 @@ from kontronik_can_gw.core.output import NodeOutput, NodeState
 from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway.first_frame import FirstFrame
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts
+from kontronik_can_gw.gateway.outage import HoldsFrames
 from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import NEVER
 
 
-class Gateway:
+class Gateway(HoldsFrames):
     """One gateway between several ESCs and one CAN bus.
 
     It sends the messages of the layout and the frames of ``outputs``. Each of the two may be empty.
@@ -38,27 +38,19 @@ class Gateway:
     ) -> None:
         slots = sum([maker.slots for maker in outputs])
         made = make_core(escs, layout, now, silent_on_loss, slots)
-        self.core: Core = made.core
+        core: Core = made.core
+        super().__init__(core, tuple([maker.make(core, now) for maker in outputs]), layout)
         self.why_python = made.why
         """The reason why the core in Python runs, or "" if the one in C runs."""
         self.layout = layout.fingerprint if layout.messages else None
         """The fingerprint of the messages, as in a DBC of ``dbc -c``. None without messages."""
         self.escs = self.core.escs
         self.status = self.core.status
-        self.outputs = tuple([maker.make(self.core, now) for maker in outputs])
         self.node_outputs = [each for each in self.outputs if isinstance(each, NodeOutput)]
         self.has_outputs = bool(self.outputs)
         """False if only messages are sent. Then the ids to receive never change."""
-        self.output_frames: list[CanFrame] = []
-        """The frames of all outputs, oldest first."""
-        for output in self.outputs:
-            self.output_frames += output.frames
-            output.frames = self.output_frames
         self.core.followers = [Follower(each.events, each.on_event) for each in self.outputs]
         self.conflicts = IdConflicts(self.core.own_ids, self.outputs)
-        self.is_held = False
-        """True if no frame may be sent except the first one after an outage (``hold``)."""
-        self._first_frame = FirstFrame(layout, self.outputs)
         self._being_saved: list[tuple[int, NodeOutput]] = []
         self._has_discarded = False
         """True if measurements were discarded since the last ``advance``."""
@@ -134,42 +126,6 @@ class Gateway:
     def can_opened(self, now: int) -> None:
         """Follow an interface that was opened. It may still return our own earlier frames."""
         self.conflicts.can_opened(now)
-
-    def can_returned(self, now: int) -> None:
-        """Send everything that has no cycle again, because frames were lost before."""
-        self._return(now)
-
-    def _return(self, now: int) -> None:
-        self.core.expire(now)
-        self.core.repeat(now)
-        for output in self.outputs:
-            output.can_returned(now)
-
-    # --- outages of the bus
-
-    def hold(self, now: int) -> None:  # noqa: ARG002  a recorded gateway needs it
-        """Send nothing until ``release``, and discard the outputs' waiting frames.
-
-        Messages and slots become pending as usual, and are packed with the values of the release. A
-        call while frames are held discards the outputs' new frames, so that answers do not get old.
-        """
-        self.is_held = True
-        if self.output_frames:
-            self.output_frames.clear()
-            for output in self.outputs:
-                output.frames_discarded()
-
-    def first_frame(self, now: int) -> CanFrame | None:
-        """Return a frame without measurements, to be sent while the others are held.
-
-        When it has left the interface, the bus works again. None if there is no such frame.
-        """
-        return self._first_frame.make(self.escs, self.status, now)
-
-    def release(self, now: int) -> None:
-        """Send frames again, with everything that has no cycle (``can_returned``)."""
-        self.is_held = False
-        self._return(now)
 
     def receive_overrun(self, now: int) -> None:
         """Follow a loss of received frames in the CAN controller."""

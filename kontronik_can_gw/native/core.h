@@ -110,6 +110,7 @@ enum {
     KCG_DROPPED_FRAMES,
     KCG_ID_CONFLICTS,
     KCG_STARTED_NS, /* Time of kcg_init. */
+    KCG_CAN_RESTARTS,
     KCG_OF_GATEWAY_COUNT
 };
 /* kcg_signal.divisor. */

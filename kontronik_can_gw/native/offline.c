@@ -25,7 +25,9 @@ enum {
     ENTRY = 16,                    /* Bytes of an entry. */
     TIME = 8,                      /* Bytes of a time. */
     SENT_FRAMES = KCG_SENT_FRAMES, /* The first counter of a COUNTERS entry in kcg.gateway. */
-    COUNTERS_COUNT = 8,            /* Number of its counters. The last one is a time. */
+    COUNTERS_COUNT = 9,            /* Number of its counters. */
+    OLD_COUNTERS_COUNT = 8,        /* In captures of version 0.5 the last one is missing. */
+    STARTED_COUNTER = 7,           /* This one is a time. */
     MAGIC = 3                      /* Bytes of "KOD". */
 };
 
@@ -190,12 +192,10 @@ int kcg_is_intact(const uint8_t *p, size_t size)
    check_counters). */
 static int are_counters(const uint8_t *data, uint32_t length)
 {
-    if (length != COUNTERS_COUNT * TIME)
+    if (length != COUNTERS_COUNT * TIME && length != OLD_COUNTERS_COUNT * TIME)
         return 0;
-    if (u64(data + (COUNTERS_COUNT - 1) * TIME) >= END_OF_TIME)
-        return 0;
-    for (int k = 0; k < COUNTERS_COUNT - 1; k++)
-        if (u64(data + k * TIME) >= MAX_COUNT)
+    for (uint32_t k = 0; k < length / TIME; k++)
+        if (u64(data + k * TIME) >= (k == STARTED_COUNTER ? END_OF_TIME : MAX_COUNT))
             return 0;
     return 1;
 }
@@ -229,7 +229,7 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
             advance(o, now);
             o->core->gateway[SENT_FRAMES] += o->count - sure;
         } else if (kind == COUNTERS && are_counters(data, length)) {
-            for (int k = 0; k < COUNTERS_COUNT; k++)
+            for (uint32_t k = 0; k < length / TIME; k++)
                 o->core->gateway[SENT_FRAMES + k] = (int64_t)u64(data + k * TIME);
         } else if (kind == NOT_SENT) {
             o->count = o->sure;

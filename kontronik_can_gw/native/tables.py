@@ -286,7 +286,7 @@ def bind(
         row.kind = KCG.OF_POWER
     elif value.name == "uptime":
         row.kind = KCG.OF_UPTIME
-    elif value.kind is Kind.GATEWAY and value.name in GATEWAY[:-1]:
+    elif value.kind is Kind.GATEWAY and value.name in GATEWAY and value.name != "started_ns":
         row.kind = KCG.OF_GATEWAY
         row.place = GATEWAY.index(value.name)
     elif value.kind in _KINDS:

@@ -95,14 +95,11 @@ class NativePoller(Poller):
         times.now = last
         times.polled = self.now
         times.bus_empty = self.before
-        request.bus = port.fileno()
-        request.count_fd = port.count_fd
-        departures = can.transmitter.departures
-        _copy_departures(departures, turns.departures)
+        _copy_departures(can.transmitter.departures, turns.departures)
         request.leave = leave
         request.due = min(due, self._core.deadline_in_python())
         request.outputs_due = gateway.next_deadline(with_core=False)
-        self._set_limits(period, can.transmitter)
+        self._set_bus(port, period, can.transmitter)
         recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
         if recorded is not None:
             recorded.prepare_turns(last)
@@ -114,7 +111,7 @@ class NativePoller(Poller):
                     self._core.receive(*turns.read())
                 turns.leave()
                 break
-        _copy_departures(turns.departures, departures)
+        _copy_departures(turns.departures, can.transmitter.departures)
         self.count += result.turns
         self.before = times.bus_empty
         self.now = times.polled
@@ -128,8 +125,10 @@ class NativePoller(Poller):
             self._finish(can, times.now)
         return self.handlers(turns.ready()) if result.happened else []
 
-    def _set_limits(self, period_ns: int, transmitter: "Transmitter") -> None:
+    def _set_bus(self, port: "CanPort", period_ns: int, transmitter: "Transmitter") -> None:
         request = self._turns.request
+        request.bus = port.fileno()
+        request.count_fd = port.count_fd
         max_turn_ns = transmitter.max_turn_ns()
         request.period = period_ns
         request.check_period = transmitter.check_period_ns

@@ -58,19 +58,31 @@ def test_an_impossible_state_is_refused_in_header_and_entry(name: str, tmp_path:
 )
 def test_impossible_counters_are_rejected_and_change_nothing(started_ns: int) -> None:
     bench = Bench(*made(1)).live(1, 0.5)
-    counters = [3] * (len(COUNTERS) - 1)
-    good = numbers_data(*counters, START - 77)
+    counters = [3] * (len(COUNTERS) - 2)  # the last two are start and restarts
+    good = numbers_data(*counters, START - 77, 4)
     now = bench.entries[-1].time_ns
     gateway = bench.setup.gateway(bench.layout, START)
     replay = Replay(gateway)
-    late_start = numbers_data(*counters, started_ns)
-    high_count = numbers_data(*counters[1:], MAX_COUNT, START)
-    for bad in (late_start, high_count):
+    late_start = numbers_data(*counters, started_ns, 4)
+    high_count = numbers_data(*counters[1:], MAX_COUNT, START, 4)
+    many_restarts = numbers_data(*counters, START, MAX_COUNT)
+    for bad in (late_start, high_count, many_restarts):
         entries = [Entry(now, EntryKind.COUNTERS, 0, data) for data in (good, bad)]
         list(replay.follow(entries))
-    assert replay.rejected == 2
+    assert replay.rejected == 3
     assert gateway.status.started_ns == START - 77
     assert gateway.status.sent_frames == 3
+    assert gateway.status.can_restarts == 4
+
+
+def test_counters_of_version_0_5_are_read() -> None:
+    bench = Bench(*made(1)).live(1, 0.5)
+    now = bench.entries[-1].time_ns
+    replay = Replay(bench.setup.gateway(bench.layout, START))
+    counters = numbers_data(*[3] * (len(COUNTERS) - 2), START)
+    list(replay.follow([*bench.entries, Entry(now, EntryKind.COUNTERS, 0, counters)]))
+    assert replay.rejected == 0
+    assert replay.gateway.status.sent_frames == 3
 
 
 @pytest.mark.parametrize("time_ns", [END_OF_TIME, (1 << 63) - 1])

@@ -51,13 +51,15 @@ def odd(chance: random.Random, last: Entry) -> Entry:
     noise = equality.stream(chance)
     return chance.choice(
         (
-            Entry(
-                now, EntryKind.CLOCK, 0, (START + chance.randrange(1 << 60)).to_bytes(8, "little")
-            ),
+            Entry(now, EntryKind.CLOCK, 0, (START + chance.randrange(1 << 60)).to_bytes(8, "little")),
             Entry(now, EntryKind.CLOCK, 0, b"short"),
             Entry(now, EntryKind.NOT_SENT),
             Entry(now, EntryKind.COUNTERS, 0, number * 8),
+            Entry(now, EntryKind.COUNTERS, 0, number * 9),
             Entry(now, EntryKind.COUNTERS, 0, number * 3),
+            Entry(now, EntryKind.HOLD),
+            Entry(now, EntryKind.FIRST_FRAME),
+            Entry(now, EntryKind.RELEASE),
             Entry(now, EntryKind.LOST, 0, number),
             Entry(now, EntryKind.FRAME, 0, b"1"),
             Entry(now, EntryKind.HELD_UP, 0, b"", 1),

@@ -63,6 +63,17 @@ def test_a_staged_install_writes_files_that_all_users_may_read(tmp_path: Path) -
     assert enabled(tmp_path) == {}
 
 
+def test_a_configuration_with_restarts_enables_the_unit_of_its_interface(tmp_path: Path) -> None:
+    install(tmp_path)
+    text = edit(tmp_path) + '[can]\nchannel = "can7"\nrestart_after_s = 0.5\n'
+    (tmp_path / CONFIGURATION).write_text(text)
+    unit = "kontronik-can-gw-restart@can7.path"
+    assert f"{unit} is enabled, because can.restart_after_s is not 0\n" in install(tmp_path).err
+    assert enabled(tmp_path)[unit] == f"/{UNITS}/kontronik-can-gw-restart@.path"
+    uninstall(tmp_path)
+    assert tree(tmp_path) == [CONFIGURATION]
+
+
 def test_an_edited_configuration_is_kept_and_changed_files_are_backed_up(tmp_path: Path) -> None:
     install(tmp_path)
     text = edit(tmp_path)

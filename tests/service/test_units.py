@@ -12,6 +12,7 @@ import pytest
 
 import kontronik_can_gw
 from kontronik_can_gw.cli.service import planned
+from kontronik_can_gw.runtime.can.interface_restart import FOLDER
 from kontronik_can_gw.runtime.system.folders import NAME, RUN
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
@@ -20,6 +21,8 @@ BESIDE = tuple(
 )
 ENABLE = "no systemd-analyze on this machine: sudo apt-get install systemd"
 MAX_EXPOSED = 2.0
+RESTART = ("kontronik-can-gw-restart@.path", "kontronik-can-gw-restart@.service")
+PROJECT = Path(__file__).resolve().parents[2]
 
 
 def files() -> dict[str, str]:
@@ -89,7 +92,34 @@ def test_the_service_has_a_low_exposure_level(tmp_path: Path, beside: bool) -> N
         assert float(found[1]) <= MAX_EXPOSED
 
 
+def test_the_restart_of_an_interface_has_a_low_exposure_level(tmp_path: Path) -> None:
+    """docs/security.md states the figure."""
+    for name in RESTART:
+        (tmp_path / name.replace("@", "@can0")).write_text(files()[name])
+    service = tmp_path / "kontronik-can-gw-restart@can0.service"
+    done = analyze("security", "--offline=true", "--no-pager", str(service))
+    assert "Overall exposure level for kontronik-can-gw-restart@can0.service: 1.1" in done.stdout
+    assert "1.1" in (PROJECT / "docs/security.md").read_text()
+    done = analyze("verify", "--man=no", *map(str, tmp_path.iterdir()))
+    lines = (done.stdout + done.stderr).splitlines()
+    assert [line for line in lines if "kontronik" in line or str(tmp_path) in line] == []
+
+
 # --- line by line
+
+
+def test_a_restart_takes_the_interface_from_the_instance_and_runs_only_ip() -> None:
+    path, service = (settings(files()[name]) for name in RESTART)
+    request = str(RUN / NAME / FOLDER / "%i")
+    assert {key: path[key] for key in path if key != "Description"} == {
+        "PathChanged": [request],
+        "WantedBy": ["multi-user.target"],
+    }
+    assert service["ExecStart"] == ["ip link set dev %i down", "ip link set dev %i up"]
+    assert service["CapabilityBoundingSet"] == service["AmbientCapabilities"] == ["CAP_NET_ADMIN"]
+    assert service["RestrictAddressFamilies"] == ["AF_NETLINK"]
+    assert service["DynamicUser"] == service["NoNewPrivileges"] == ["yes"]
+    assert not [name for name in service if name.startswith(("EnvironmentFile", "PassEnv"))]
 
 
 EVERY = [*NAMES, *BESIDE]
@@ -123,7 +153,9 @@ def test_a_service_that_reports_to_systemd_is_watched(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in EVERY if "metrics" not in name])
 def test_a_service_may_write_the_locks_that_all_gateways_share(name: str) -> None:
-    assert settings(files()[name])["ReadWritePaths"] == [f"-{RUN / NAME / 'lock'}"]
+    lock = f"-{RUN / NAME / 'lock'}"
+    wanted = f"{lock} -{RUN / NAME / 'restart'}" if name in NAMES else lock
+    assert settings(files()[name])["ReadWritePaths"] == [wanted]
 
 
 @pytest.mark.parametrize("name", NAMES)

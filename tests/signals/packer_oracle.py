@@ -275,7 +275,7 @@ KNOWN: dict[str, Known] = {
     "uptime": Known("s", _uptime, gateway=True),
     **_counters(
         "sent_frames replaced_frames send_failures received_frames bus_off_count dropped_frames "
-        "id_conflicts",
+        "id_conflicts can_restarts",
         lambda _, gateway: gateway,
         gateway=True,
     ),

@@ -294,6 +294,7 @@ def _can_lines(document: Document) -> Iterator[Text]:
         "dropped_frames": "dropped",
         "send_failures": "send failures",
         "bus_off_count": "bus-off",
+        "can_restarts": "restarts",
         "id_conflicts": "id conflicts",
     }
     counts = ", ".join(f"{number(can['counters'][key])} {label}" for key, label in labels.items())

@@ -17,6 +17,7 @@ from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.runtime.can.can_controller import CanController
 from kontronik_can_gw.runtime.can.can_opener import CanOpener
 from kontronik_can_gw.runtime.can.can_port import CanPort
+from kontronik_can_gw.runtime.can.interface_restart import InterfaceRestart
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.can.transmitter import Transmitter
@@ -76,6 +77,7 @@ class CanLink:
             poller.register(fd, self.hear)
         self.must_open = False
         """True during the first opening by the thread, if its failure ends the gateway."""
+        self._restart = InterfaceRestart(config, gateway, conditions)
         self._opener = CanOpener(config, esc_at)
         poller.register(self._opener.fileno(), self._follow_opener)
 
@@ -210,6 +212,8 @@ class CanLink:
 
     def _lost(self, answer: Sent, now: int) -> None:
         """Close an interface that is down or was removed, and schedule its opening."""
+        if answer is Sent.DOWN:
+            self._restart.went_down(now)
         self._close_port()
         self._failed(_reason_of_loss(self.config, answer), now)
         self.controller.ask(now)  # it may already be usable again
@@ -291,6 +295,7 @@ class CanLink:
             transmitter.forget_failures()
             return
         answer = transmitter.transmit(port, now)
+        self._restart.follow(transmitter.outage_since, now)
         if answer is None:
             return
         if answer is _OK:

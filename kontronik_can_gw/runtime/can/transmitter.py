@@ -72,6 +72,11 @@ class Transmitter:
         """True if no frame waits, and the port refused none since it last accepted one."""
         return not len(self.queue) and self._busy_since is None
 
+    @property
+    def outage_since(self) -> int | None:
+        """A time since which no frame has left the open interface. None without an outage."""
+        return self._held_since
+
     def put(self, frames: Sequence[CanFrame]) -> None:
         """Append frames to the transmit queue."""
         if self.queue.put_all(frames):
@@ -239,6 +244,7 @@ class Transmitter:
     def _release(self, now: int) -> None:
         """Send everything again."""
         self.due = NEVER
+        self._held_since = None
         self._first_frame_at = None
         self.departures.forget()
         if self.is_stalled:

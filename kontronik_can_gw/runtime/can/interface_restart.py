@@ -1,0 +1,111 @@
+"""Asks systemd to restart a CAN interface from which no frame leaves.
+
+The gateway has no privileges. It writes a file, and a path unit of systemd then starts a service
+that sets the interface down and up (kontronik-can-gw-restart@.path and .service). The name of the
+interface is that of the unit's instance. The content of the file does not matter.
+"""
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+
+from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.runtime.system import folders
+from kontronik_can_gw.runtime.system.fault_log import FaultLog
+from kontronik_can_gw.times import NEVER, SECOND
+
+FOLDER = "restart"
+"""Name of the folder of the requests, which has a file for each interface."""
+MAX_PAUSE_NS = 10 * SECOND
+ANSWER_NS = 2 * SECOND
+"""An interface that goes down within this time after a request is restarted because of it."""
+
+
+def request_file(channel: str) -> Path:
+    """Return the file whose change requests a restart of an interface."""
+    return folders.runtime_folder(FOLDER) / channel
+
+
+def request(channel: str) -> None:
+    """Request a restart. Does nothing if the file cannot be written."""
+    with contextlib.suppress(OSError):
+        folders.make_runtime_folder(FOLDER)
+        request_file(channel).write_bytes(b"")
+
+
+class InterfaceRestart:
+    """Requests restarts of one interface.
+
+    1. The first request of an outage follows ``can.restart_after_s`` after its begin.
+    2. If no frame leaves after a restart, the pause doubles, up to MAX_PAUSE_NS.
+    3. A restart is counted when the interface has gone down after a request.
+    """
+
+    def __init__(
+        self,
+        config: CanConfig,
+        gateway: Gateway,
+        conditions: FaultLog,
+        ask: Callable[[str], None] = request,
+    ) -> None:
+        self.condition = f"CAN {config.channel}: restart"
+        self._channel = config.channel
+        self._after_ns = 0
+        if config.interface == "socketcan":
+            self._after_ns = round(config.restart_after_s * SECOND)
+        self._status = gateway.status
+        self._conditions = conditions
+        self._ask = ask
+        self._pause_ns = self._after_ns
+        """Pause before the next request."""
+        self._requested_ns = -NEVER
+        """Time of the last request that has not been answered by a restart."""
+        self._restarts = 0
+        """Number of restarts since a frame has left the interface."""
+
+    def follow(self, outage_since: int | None, now: int) -> None:
+        """Request a restart if it is due. The interface must be up, and not in bus-off.
+
+        ``outage_since`` is a time since which no frame has left. None without an outage.
+        """
+        if not self._after_ns:
+            return
+        if outage_since is None:
+            self._end(now)
+            return
+        if self._requested_ns > 0 and now - self._requested_ns > ANSWER_NS:
+            self._requested_ns = -NEVER
+            text = (
+                f"CAN {self._channel}: the interface was not restarted. Enable the unit: "
+                f"sudo systemctl enable --now kontronik-can-gw-restart@{self._channel}.path"
+            )
+            self._conditions.begin(self.condition, text, now)
+        if now - max(outage_since, self._requested_ns) < self._pause_ns:
+            return
+        self._requested_ns = now
+        self._pause_ns = min(2 * self._pause_ns, max(MAX_PAUSE_NS, self._after_ns))
+        self._ask(self._channel)
+
+    def went_down(self, now: int) -> None:
+        """Follow an interface that was set down. Counts it if a restart was requested."""
+        if now - self._requested_ns > ANSWER_NS:
+            return
+        self._requested_ns = -NEVER
+        self._status.can_restarts += 1
+        self._restarts += 1
+        if self._restarts == 1:
+            text = f"CAN {self._channel}: no frame left it, so it is restarted"
+            self._conditions.event(f"{self.condition}s", text, now)
+        self._conditions.forget(self.condition)
+
+    def _end(self, now: int) -> None:
+        """Follow a frame that has left the interface."""
+        if self._restarts:
+            count = "one restart" if self._restarts == 1 else f"{self._restarts} restarts"
+            text = f"CAN {self._channel}: works again after {count}"
+            self._conditions.event(f"{self.condition}s", text, now)
+        self._restarts = 0
+        self._requested_ns = -NEVER
+        self._pause_ns = self._after_ns
+        self._conditions.forget(self.condition)
