@@ -319,7 +319,7 @@ class _CanFaults:
         self._has_outage = False
 
     def returned(self, now: int, has_lost_frames: bool) -> None:
-        """Follow an interface that sends frames again. Boot-ups that were discarded are repeated."""
+        """Follow an interface that sends frames again. Discarded boot-ups are repeated."""
         if self._is_unsent and has_lost_frames:
             self._has_outage = True
             self._was_off = self._was_off or self._unsent_was_off

@@ -182,3 +182,31 @@ def test_without_ip_or_its_json_the_rest_is_checked(tree: Tree, shown: str | Non
     if shown is not None:
         tree.programs["ip",] = shown
     assert grave(check_can(tree, PLAIN)) == {"can.up": ERROR, "can.details": NOTE}
+
+
+@pytest.mark.parametrize(
+    ("driver", "restart_ms", "warns"),
+    [("mcp251xfd", 100, True), ("mcp251xfd", 0, False), ("mcp251x", 100, False)],
+)
+def test_restart_ms_is_warned_about_only_with_a_driver_that_crashes(
+    tree: Tree, driver: str, restart_ms: int, warns: bool
+) -> None:
+    interface(tree, info(restart_ms=restart_ms))
+    (tree.root / "sys/class/net/can0/device/driver").symlink_to(f"../../bus/spi/drivers/{driver}")
+    findings = check_can(tree, PLAIN)
+    said = [each for each in findings if "6916" in each.text]
+    assert bool(said) == warns
+    assert all(each.command.endswith("type can restart-ms 0") for each in said)
+
+
+@pytest.mark.parametrize("is_enabled", [False, True])
+def test_restarts_need_the_enabled_unit(tree: Tree, is_enabled: bool) -> None:
+    interface(tree, {})
+    wants = tree.root / "etc/systemd/system/multi-user.target.wants"
+    wants.mkdir(parents=True)
+    if is_enabled:
+        unit = "kontronik-can-gw-restart@can0.path"
+        (wants / unit).symlink_to("/etc/systemd/system/kontronik-can-gw-restart@.path")
+    findings = check_can(tree, CanConfig(restart_after_s=0.5))
+    assert ("can.restart_unit" in grave(findings)) == (not is_enabled)
+    assert "can.restart_unit" not in {each.check for each in check_can(tree, PLAIN)}

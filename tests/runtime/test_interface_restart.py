@@ -1,4 +1,4 @@
-"""Requests to restart an interface from which no frame leaves: when, how often, and what is said."""
+"""Requests to restart an interface from which no frame leaves: times, numbers, log lines."""
 
 import logging
 from itertools import pairwise
@@ -133,3 +133,22 @@ def test_a_request_changes_the_file_of_the_interface(tmp_path: Path) -> None:
     request("can7")
     assert request_file("can7").stat().st_mtime_ns >= first
     assert request_file("can7").read_bytes() == b""
+
+
+@pytest.mark.parametrize(("restart_ms", "is_asked"), [(0, True), (100, False)])
+def test_bus_off_is_restarted_only_if_it_does_not_end_by_itself(
+    kernel: Kernel,  # noqa: F811
+    restart_ms: int,
+    is_asked: bool,
+) -> None:
+    bench = Bench(kernel)
+    asked: list[str] = []
+    bench.can._restart = InterfaceRestart(
+        CanConfig(restart_after_s=0.5), bench.gateway, FaultLog(), asked.append
+    )
+    bench.begin()
+    bench.goes_off()
+    assert kernel.facts is not None
+    kernel.facts = kernel.facts._replace(restart_ms=restart_ms)
+    bench.turn(1200)
+    assert bool(asked) == is_asked

@@ -21,6 +21,8 @@ from kontronik_can_gw.runtime.can.link_commands import (
 _CAN_TYPE = "280"
 """ARPHRD_CAN"""
 _FD_MTU = 72
+_CRASHING_DRIVER = "mcp251xfd"
+"""Driver of the MCP2517FD and MCP2518FD. See raspberrypi/linux, issue 6916."""
 _STATES = {"ERROR-ACTIVE": "active", "ERROR-WARNING": "warning", "ERROR-PASSIVE": "warning"}
 _MODES = {"LISTEN-ONLY": "listen_only", "LOOPBACK": "loopback"}
 
@@ -73,7 +75,15 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
     elif not virtual:
         # an slcan interface has no device, and cannot leave bus-off by itself
         has_restart = kind != "can" or machine.exists(f"{folder}/device")
-        _controller(findings, can, link.get("info_data", {}), is_up, has_restart)
+        data = link.get("info_data", {})
+        _controller(findings, can, data, is_up, has_restart)
+        driver = machine.target_of(f"{folder}/device/driver").rpartition("/")[2]
+        if driver == _CRASHING_DRIVER and data.get("restart_ms", 0):
+            findings.say("can.restart", "may_crash", driver=driver, ms=data["restart_ms"])
+    if can.restart_after_s and not virtual:
+        watched = f"multi-user.target.wants/kontronik-can-gw-restart@{can.channel}.path"
+        is_enabled = machine.target_of(f"/etc/systemd/system/{watched}")
+        findings.say("can.restart_unit", "ok" if is_enabled else "off")
     return findings.found
 
 

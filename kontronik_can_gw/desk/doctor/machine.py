@@ -52,6 +52,12 @@ class Machine:
             return self.path(name).read_bytes().decode("utf-8", "replace").strip("\0\n ")
         return ""
 
+    def target_of(self, name: str) -> str:
+        """Return the target of a symbolic link. Empty if there is none."""
+        with contextlib.suppress(OSError):
+            return str(self.path(name).readlink())
+        return ""
+
     def names(self, folder: str) -> list[str]:
         """Return the names in a folder. Empty if it cannot be read."""
         with contextlib.suppress(OSError):

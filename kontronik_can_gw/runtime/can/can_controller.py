@@ -54,6 +54,13 @@ class CanController:
         if self._monitor is not None:
             self.due = 0
 
+    @property
+    def stays_off_since(self) -> int | None:
+        """Time of a bus-off that does not end by itself (restart-ms 0). None otherwise."""
+        if not self.is_off or self.facts is None or self.facts.restart_ms != 0:
+            return None
+        return self._off_since
+
     def fileno(self) -> int | None:
         """Return a descriptor that is readable when the kernel has sent a report.
 

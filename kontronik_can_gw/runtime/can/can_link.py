@@ -293,6 +293,9 @@ class CanLink:
         if port is None or self.controller.is_off:
             transmitter.hold(now)
             transmitter.forget_failures()
+            off_since = self.controller.stays_off_since
+            if port is not None and off_since is not None:
+                self._restart.follow(off_since, now)
             return
         answer = transmitter.transmit(port, now)
         self._restart.follow(transmitter.outage_since, now)
