@@ -51,7 +51,9 @@ def odd(chance: random.Random, last: Entry) -> Entry:
     noise = equality.stream(chance)
     return chance.choice(
         (
-            Entry(now, EntryKind.CLOCK, 0, (START + chance.randrange(1 << 60)).to_bytes(8, "little")),
+            Entry(
+                now, EntryKind.CLOCK, 0, (START + chance.randrange(1 << 60)).to_bytes(8, "little")
+            ),
             Entry(now, EntryKind.CLOCK, 0, b"short"),
             Entry(now, EntryKind.NOT_SENT),
             Entry(now, EntryKind.COUNTERS, 0, number * 8),

@@ -79,11 +79,11 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
         _controller(findings, can, data, is_up, has_restart)
         driver = machine.target_of(f"{folder}/device/driver").rpartition("/")[2]
         if driver == _CRASHING_DRIVER and data.get("restart_ms", 0):
-            findings.say("can.restart", "may_crash", driver=driver, ms=data["restart_ms"])
+            findings.add("can.restart", "may_crash", driver=driver, ms=data["restart_ms"])
     if can.restart_after_s and not virtual:
         watched = f"multi-user.target.wants/kontronik-can-gw-restart@{can.channel}.path"
         is_enabled = machine.target_of(f"/etc/systemd/system/{watched}")
-        findings.say("can.restart_unit", "ok" if is_enabled else "off")
+        findings.add("can.restart_unit", "ok" if is_enabled else "off")
     return findings.found
 
 
