@@ -20,6 +20,8 @@ class GatewayState(IntEnum):
     RUNNING = 1
     STOPPING = 2
     REPLAY = 3
+    QUIET = 4
+    """No ESC has been heard for ``can.quiet_after_s``. Only requests are answered."""
 
 
 class CanState(IntEnum):
@@ -63,6 +65,10 @@ class GatewayStatus:
     """Received frames with an id that only this gateway may use."""
     can_restarts: int = 0
     """Restarts of the CAN interface that were requested because no frame left it."""
+    heard_ns: int = 0
+    """Last time at which an ESC was heard, or the start. Old while there are live data."""
+    is_quiet: bool = False
+    """True in quiet mode. The core writes this and ``heard_ns``."""
 
     def frozen(self) -> "GatewayStatus":
         """Return a copy, which other threads may read."""

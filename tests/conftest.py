@@ -61,6 +61,7 @@ ON_BOTH_CORES = (
     "canopen/test_sync_at_once.py",
     "runtime/test_hold_ups.py",
     "runtime/test_esc_input.py",
+    "runtime/test_quiet_mode_in_the_loop.py",
     "runtime/test_snapshot.py",
     "recordings/test_plain_bytes.py",
     "recordings/test_tables.py",

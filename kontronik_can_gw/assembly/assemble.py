@@ -14,7 +14,13 @@ from kontronik_can_gw.assembly.this_machine import ThisMachine, parameter_folder
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
 from kontronik_can_gw.core.output_setup import OUTPUTS, Machine, OutputSetup, setup_module
-from kontronik_can_gw.dbc.prepare import check_load, prepare, unreported, unsupplied
+from kontronik_can_gw.dbc.prepare import (
+    check_load,
+    prepare,
+    unreported,
+    unsupplied,
+    without_quiet,
+)
 from kontronik_can_gw.dbc.reader import parse_database, read_dbc
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -222,6 +228,8 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
         damaged += fitted.faults
     mute = unreported(dbc.layout, config.dbc.silent_on_loss)
     mute += unsupplied(dbc.layout, escs)
+    if config.can.quiet_after_s:
+        mute += without_quiet(dbc.layout)
     return Loaded(
         config=config,
         escs=escs,

@@ -4,6 +4,7 @@ JSON keys of the header::
 
     format, version  "kontronik-can-gw capture", 2
     program          version, python, machine
+    quiet_after_ns   can.quiet_after_s in ns. Missing in captures of 0.5.0
     configuration    the effective TOML text
     file             the path of the configuration
     escs             settings of each ESC that were in effect, with a gear such as "31/4"
@@ -84,6 +85,7 @@ class CaptureSetup:
     version: int = VERSION
     """The version of the capture's format. 0.5.0 wrote version 1."""
     outputs: tuple[OutputSetup, ...] = ()
+    quiet_after_ns: int = 0
 
     def header(self) -> dict[str, Any]:
         """Return the header's JSON content."""
@@ -102,6 +104,7 @@ class CaptureSetup:
             "escs": [esc_json(esc) for esc in self.escs],
             "ports": list(self.ports),
             "dbc": self._dbc_json(),
+            "quiet_after_ns": self.quiet_after_ns,
             **in_header,
             "outputs": outputs,
         }
@@ -155,6 +158,7 @@ class CaptureSetup:
             file=str(header["file"]),
             version=header["version"],
             outputs=_outputs_of(header, escs),
+            quiet_after_ns=whole_number(header.get("quiet_after_ns", 0), 0, END_OF_TIME - 1),
         )
 
     def database(self) -> tuple["Database", Layout] | None:
@@ -167,7 +171,8 @@ class CaptureSetup:
 
     def gateway(self, layout: Layout, now: int) -> Gateway:
         """Return the gateway in its state before the start."""
-        return Gateway(self.escs, layout, now, self.dbc_settings.silent_on_loss, self.outputs)
+        silent_on_loss = self.dbc_settings.silent_on_loss
+        return Gateway(self.escs, layout, now, silent_on_loss, self.outputs, self.quiet_after_ns)
 
 
 def _outputs_of(header: Header, escs: Sequence[EscSettings]) -> tuple[OutputSetup, ...]:

@@ -72,6 +72,8 @@ class Emergencies:
         """Time since which emergencies are delayed. NEVER if they are not."""
         self._open = False
         self._last_ns = -NEVER
+        self.is_quiet = False
+        """True if no emergencies are sent. ``repeat`` sends them afterwards."""
         self._had_error = False
         """True if there was an error since the last reset."""
         self._bind_objects()
@@ -268,7 +270,7 @@ class Emergencies:
         while self._pending and now >= self._last_ns + self._inhibit_ns:
             condition, data = self._pending.popleft()
             cob_id = self.cob_id
-            if not cob_id & INVALID_BIT:
+            if not (cob_id & INVALID_BIT or self.is_quiet):
                 self._send(cob_id & 0x7FF, data)
                 self._last_is_error = condition is not None
                 self._last_ns = now

@@ -122,12 +122,13 @@ class Producer:
         self._dictionary = dictionary
         self._send = send
         self._period = 0
+        self._is_quiet = False
         dictionary.bind(0x1017, written=self.configure)
 
     def configure(self, now: int) -> None:
         """Take over 1017h. The next heartbeat is sent one new period from now."""
         self._period = self._dictionary.number(0x1017) * MS
-        self.due = now + self._period if self._period else NEVER
+        self._set_due(now + self._period)
 
     def stop(self) -> None:
         """Send no heartbeats, whatever 1017h is, because the node has no node-ID."""
@@ -136,8 +137,15 @@ class Producer:
 
     def beat(self, now: int) -> None:
         """Make the next heartbeat due now, unless 1017h is 0."""
-        if self._period:
-            self.due = now
+        self._set_due(now)
+
+    def set_quiet(self, is_quiet: bool, now: int) -> None:
+        """Send no heartbeats while ``is_quiet``. Afterwards, begin after one period."""
+        self._is_quiet = is_quiet
+        self._set_due(now + self._period)
+
+    def _set_due(self, due: int) -> None:
+        self.due = due if self._period and not self._is_quiet else NEVER
 
     def advance(self, now: int) -> None:
         """Send a heartbeat if it is due. Missed heartbeats are not sent later."""
@@ -172,6 +180,7 @@ class Consumer:
         self._changed = changed
         self._watched: dict[int, _Watched] = {}
         self._judged_from = -NEVER
+        self._is_quiet = False
         for variable in dictionary.subs(0x1016):
             variable.check = partial(self._check, variable)
             variable.written = self._written
@@ -188,10 +197,19 @@ class Consumer:
     @property
     def due(self) -> int:
         """Earliest time at which ``advance`` acts."""
-        if not self._watched:
+        if not self._watched or self._is_quiet:
             return NEVER
         first_due = min(watched.due for watched in self._watched.values())
         return max(self._judged_from, first_due)
+
+    def set_quiet(self, is_quiet: bool) -> None:
+        """Report no missing heartbeats while ``is_quiet``.
+
+        Afterwards, the watch over each node begins again with its next heartbeat.
+        """
+        self._is_quiet = is_quiet
+        for watched in self._watched.values():
+            watched.due = NEVER
 
     def held_up(self, now: int) -> None:
         """Note that the process was held up until ``now``, so heartbeats may still be unread."""
@@ -221,6 +239,8 @@ class Consumer:
 
     def _report_late(self, until: int, now: int) -> None:
         """Report the heartbeats that were due before ``until``."""
+        if self._is_quiet:
+            return
         times: dict[int, int] = {}
         for node_id, watched in self._watched.items():
             if until >= watched.due:

@@ -93,7 +93,7 @@ class Node:
         self.nmt = Nmt(dictionary, settings.self_start, self._entered)
         codes = BitCodes(esc.protocol.errors.get("operating_errors", ()))
         self.emergencies = Emergencies(dictionary, self._send, is_used, codes)
-        self._producer = Producer(dictionary, self._send_heartbeat)
+        self.producer = Producer(dictionary, self._send_heartbeat)
         self.consumer = Consumer(dictionary, self._watch_changed)
         self.sync = SyncConsumer(dictionary, is_used)
         self.sdo = SdoServer(dictionary, self._send_sdo, settings.segment_ns)
@@ -119,7 +119,7 @@ class Node:
             changed=partial(core.apply, number),
         )
         self._timers = (
-            self._producer,
+            self.producer,
             self.consumer,
             self.sdo,
             self.emergencies,
@@ -236,9 +236,9 @@ class Node:
         self.consumer.reset()
         self.nmt.state = NmtState.INITIALISING
         if node_id == UNCONFIGURED:
-            self._producer.stop()
+            self.producer.stop()
         else:
-            self._producer.configure(now)
+            self.producer.configure(now)
             self._send_heartbeat()  # the boot-up message
             self.nmt.enter(NmtState.PRE_OPERATIONAL, now)
             if self.nmt.starts_itself:
@@ -282,7 +282,7 @@ class Node:
         if self.nmt.boots_after_outage and self.node_id != UNCONFIGURED:
             self.reset_communication(now)
         else:
-            self._producer.beat(now)
+            self.producer.beat(now)
             self.repeat(now)
 
     def repeat(self, now: int) -> None:

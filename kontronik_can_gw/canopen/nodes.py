@@ -48,6 +48,7 @@ class Nodes(NodeOutput):
         self._to_watchers: deque[CanFrame] = deque()
         """Heartbeats of our nodes, for those of our nodes that watch them."""
         self._is_on = False
+        self._is_quiet = False
         self._reported: list[NodeState] = []
         """The states in the log."""
         numbers = range(len(host.escs))
@@ -76,7 +77,7 @@ class Nodes(NodeOutput):
         if frame.can_id == NMT and command(frame.data, ALL_NODES) in RESETS:
             for node in self.nodes:
                 node.tpdos.release_ids()
-        self._route(frame, now, at)
+        _route(self._routes, frame, now, at)
         if frame.can_id == LSS_REQUEST:
             # Equal answers that several slaves send at once are one frame on a bus.
             self.frames[begin:] = dict.fromkeys(self.frames[begin:])
@@ -100,6 +101,8 @@ class Nodes(NodeOutput):
         self._finish(now)
 
     def can_returned(self, now: int, has_lost_frames: bool = False) -> None:
+        if self._is_quiet:
+            return
         if not self._is_on:
             self.start(now, can_open=True)
             return
@@ -113,6 +116,15 @@ class Nodes(NodeOutput):
             if node.node_id != UNCONFIGURED:
                 return CanFrame(HEARTBEAT + node.node_id, bytes([node.state]))
         return None
+
+    def set_quiet(self, is_quiet: bool, now: int) -> None:
+        self._is_quiet = is_quiet
+        self._can_faults.set_quiet(is_quiet)
+        for node in self.nodes:
+            node.emergencies.is_quiet = is_quiet
+            node.consumer.set_quiet(is_quiet)
+            node.producer.set_quiet(is_quiet, now)
+        self._finish(now)
 
     def held_up(self, now: int) -> None:
         for node in self.nodes:
@@ -242,7 +254,7 @@ class Nodes(NodeOutput):
         while self._to_watchers:
             # Own frames do not come back from the bus, but one of our nodes may watch another.
             frame = self._to_watchers.popleft()
-            self._route(frame, now, now)
+            _route(self._routes, frame, now, now)
         if self._has_changed and self._is_on:
             self._has_changed = False
             self._routes = _routes(self.nodes)
@@ -254,9 +266,11 @@ class Nodes(NodeOutput):
             node.set_due()
         self.due = min([node.due for node in self.nodes])
 
-    def _route(self, frame: CanFrame, now: int, at: int) -> None:
-        for take in self._routes.get(frame.can_id, ()):
-            take(frame.data, now, at)
+
+def _route(routes: Mapping[int, Sequence[FrameTaker]], frame: CanFrame, now: int, at: int) -> None:
+    """Give a frame that arrived ``at`` to the functions of its COB-ID."""
+    for take in routes.get(frame.can_id, ()):
+        take(frame.data, now, at)
 
 
 def _routes(nodes: Sequence[Node]) -> dict[int, list[FrameTaker]]:
@@ -278,6 +292,7 @@ class _CanFaults:
     def __init__(self, nodes: Sequence[Node]) -> None:
         self._nodes = nodes
         self._next_overrun_ns = 0
+        self._is_quiet = False
         self._was_off = False
         self._has_outage = False
         self._is_unsent = False
@@ -304,8 +319,15 @@ class _CanFaults:
         elif self._has_outage and state is not CanState.UNKNOWN:
             self.frames_pass(now)
 
+    def set_quiet(self, is_quiet: bool) -> None:
+        """Begin quiet mode, which is an outage for the nodes, or allow its end to be followed."""
+        self._is_quiet = is_quiet
+        self._has_outage = True
+
     def frames_pass(self, now: int) -> None:
         """Follow an interface that takes frames again after some were lost."""
+        if self._is_quiet:
+            return
         for node in self._nodes:
             if self._has_outage:
                 node.returned(now)

@@ -183,6 +183,7 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
         "can_state": int(gateway.status.can_state),
         "is_held": int(gateway.is_held),
         "started_ns": gateway.status.started_ns,
+        "heard_ns": max([gateway.status.heard_ns, *[esc.live_ns or 0 for esc in gateway.escs]]),
     }
 
 

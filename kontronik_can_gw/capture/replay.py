@@ -177,6 +177,8 @@ class Replay:
             esc.losses = losses
         if "started_ns" in state:
             self.gateway.status.started_ns = state["started_ns"]
+        if "heard_ns" in state:
+            self.gateway.status.heard_ns = state["heard_ns"]
         if "can_state" in state:
             self.gateway.status.can_state = CanState(state["can_state"])
         if state.get("is_held"):

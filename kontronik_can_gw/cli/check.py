@@ -144,6 +144,8 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     if can.fd:
         rate += f", data {can.data_bitrate // 1000} kbit/s"
     yield f"  CAN       {can.channel} ({can.interface}), {rate}"
+    if can.quiet_after_s:
+        yield f"            quiet after {can.quiet_after_s} s without telemetry"
     if config.dbc.enabled:
         keys = sorted((each.extended, each.can_id) for each in loaded.layout.messages)
         ids = [f"{can_id:08X}h" if extended else f"{can_id:03X}h" for extended, can_id in keys]

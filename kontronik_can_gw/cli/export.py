@@ -43,9 +43,10 @@ def main(args: argparse.Namespace) -> int:
     folder = Path(output_of(args, "DIR"))
     bus = bus_layout(args)
     silent_on_loss = bus.config is not None and bus.config.dbc.silent_on_loss
+    quiet_after_ns = 0 if bus.config is None else bus.config.can.quiet_after_ns
     licence = shipped("LICENSE").read_text(encoding="utf-8")
     try:
-        files = exported(bus.layout, bus.escs, silent_on_loss, licence)
+        files = exported(bus.layout, bus.escs, silent_on_loss, licence, quiet_after_ns)
     except NotInCore as error:
         raise UserError(f"{bus.layout.file}: cannot be exported: {error}") from None
     if bus.config is not None and bus.config.canopen.enabled:

@@ -47,7 +47,13 @@ def recorded(
     recorder = Recorder(folder, loaded.config.record)
     recorder.words = in_words(loaded.config, folder)
     gateway = RecordedGateway(
-        recorder.put, loaded.escs, loaded.layout, now, silent_on_loss, loaded.outputs
+        recorder.put,
+        loaded.escs,
+        loaded.layout,
+        now,
+        silent_on_loss,
+        loaded.outputs,
+        loaded.config.can.quiet_after_ns,
     )
     known = {
         "created_ns": now,
@@ -71,4 +77,5 @@ def setup_of(loaded: Loaded) -> CaptureSetup:
         as_toml(config),
         config.file,
         outputs=loaded.outputs,
+        quiet_after_ns=config.can.quiet_after_ns,
     )

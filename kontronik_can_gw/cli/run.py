@@ -172,7 +172,15 @@ class _Run:
             return recorded(loaded, self._args.record, now, silent_on_loss)
         from kontronik_can_gw.gateway.gateway import Gateway
 
-        return Gateway(loaded.escs, loaded.layout, now, silent_on_loss, loaded.outputs), None
+        gateway = Gateway(
+            loaded.escs,
+            loaded.layout,
+            now,
+            silent_on_loss,
+            loaded.outputs,
+            config.can.quiet_after_ns,
+        )
+        return gateway, None
 
 
 def _begin_realtime(priority: int | None, wait: bool) -> None:

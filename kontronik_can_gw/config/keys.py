@@ -35,7 +35,7 @@ from kontronik_can_gw.config.output_keys import (
 from kontronik_can_gw.esc.protocols import PROTOCOLS, device_names, protocol_named, protocol_names
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.status import UNCONFIGURED
-from kontronik_can_gw.times import MS
+from kontronik_can_gw.times import MS, SECOND
 
 REQUIRED = MISSING
 """Default of a key that must be given."""
@@ -51,7 +51,9 @@ A removed key is ignored with a warning for a year, because a gateway must not f
 upgrade.
 """
 
-_OF_CAN = frozenset({"interface", "channel", "bitrate", "fd", "data_bitrate", "restart_after_s"})
+_OF_CAN = frozenset(
+    {"interface", "channel", "bitrate", "fd", "data_bitrate", "restart_after_s", "quiet_after_s"}
+)
 
 
 # fmt: off
@@ -74,6 +76,13 @@ class CanConfig:
     options: Mapping[str, str | float] = key(options("can", _OF_CAN), {},
         "more options of the python-can interface, for example host or ttyBaudrate. "
         "SocketCAN has none")
+    quiet_after_s: int = key(integer(0, 604_800), 0,
+        "seconds without telemetry after which the gateway only answers requests, "
+        "until telemetry returns. 0: never")
+
+    @property
+    def quiet_after_ns(self) -> int:
+        return self.quiet_after_s * SECOND
 
 
 @dataclass(frozen=True)

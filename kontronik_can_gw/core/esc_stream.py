@@ -28,7 +28,7 @@ from kontronik_can_gw.esc.telemetry import (
     Event,
     LinkState,
 )
-from kontronik_can_gw.times import SECOND
+from kontronik_can_gw.times import NEVER, SECOND
 
 _DEGRADED_BYTES_PER_DROPPED = 10
 """A link is degraded if more than one byte in this many is dropped."""
@@ -160,7 +160,11 @@ class EscStream(EscTelemetry):
 
     def next_deadline(self) -> int:
         """Return the time of the next call of ``advance`` that can change anything."""
-        deadline = self._window_ns + SECOND
+        return min(self._window_ns + SECOND, self.expiry())
+
+    def expiry(self) -> int:
+        """Return the time at which live or info data are too old, or NEVER."""
+        deadline = NEVER
         if self.live is not None:
             deadline = min(deadline, self.live_bound_ns + self.settings.timeout_ns + 1)
         if self.info_bound_ns is not None:

@@ -86,7 +86,13 @@ class Core(Protocol):
         """Drop expired values."""
 
     def advance(self, now: int) -> None:
-        """Let time pass: drop expired values, and mark messages and slots whose cycle is due."""
+        """Let time pass: drop expired values, and mark messages and slots whose cycle is due.
+
+        Quiet mode begins when no ESC has been heard for the configured time. The messages with
+        values of the gateway are sent for the last time then, and nothing else becomes pending
+        (``status.is_quiet``). The first call with live data ends it. Both changes are reported as
+        ``Event.QUIET``.
+        """
 
     def next_deadline(self) -> int:
         """Return the time at which ``advance`` must be called. Earlier calls do no harm."""

@@ -234,6 +234,7 @@ class Messages:
         self.pending: dict[int, int] = {}
         """Indices of the messages that ``take`` sends, and the times at which they became due."""
         self._stopping = False
+        self._quiet = False
 
     @property
     def next_due(self) -> int:
@@ -244,6 +245,8 @@ class Messages:
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Mark the messages that follow these events of an ESC (bits of telemetry.Event)."""
+        if self._quiet:
+            return
         state = self._escs[esc]
         up = state.live is not None
         # Live or info data have ended. No later event sends the remaining pages.
@@ -259,6 +262,8 @@ class Messages:
 
         With ``each_second`` only its counters changed, which matters for messages without a cycle.
         """
+        if self._quiet:
+            return
         for message in self._of_gateway:
             if not (each_second and message.plan.cycle_ns):
                 self._request(message, now)
@@ -268,6 +273,8 @@ class Messages:
 
         Receivers must not keep values from before a restart or an outage.
         """
+        if self._quiet:
+            return
         for message in self._messages:
             message.last.clear()
             if not message.plan.cycle_ns:
@@ -276,7 +283,28 @@ class Messages:
 
     def stop(self, now: int) -> None:
         """Send the messages with the gateway's own state at once, all pages, at any distance."""
-        self._stopping = True
+        if not self._quiet:
+            self._stopping = True
+            self._send_last(now)
+
+    def begin_quiet(self, now: int) -> None:
+        """Send the messages with the gateway's own state at once, then nothing."""
+        for index in self.pending:
+            self._messages[index].why = 0
+        self.pending = {}
+        for message in self._messages:
+            message.pages_to_send.clear()
+        self._send_last(now)
+        self._quiet = True
+
+    def end_quiet(self, now: int) -> None:
+        """Send everything again."""
+        self._quiet = False
+        self.on_gateway_change(now)
+        self.repeat(now)
+
+    def _send_last(self, now: int) -> None:
+        """Send the messages with the gateway's own state at once, all pages, at any distance."""
         for message in self._of_gateway:
             if message.by_event:
                 message.add_all_pages()
@@ -316,7 +344,7 @@ class Messages:
             message.why = 0
             if self._prepare(message, why, now):
                 frames.append(self._frame(message, now))
-                while self._stopping and message.pages_to_send:
+                while (self._stopping or self._quiet) and message.pages_to_send:
                     frames.append(self._frame(message, now))
         return frames
 

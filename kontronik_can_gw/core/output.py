@@ -133,6 +133,14 @@ class Output:
         """Return a frame without measurements as the first one after an outage, or None."""
         return None
 
+    def set_quiet(self, is_quiet: bool, now: int) -> None:
+        """Begin or end quiet mode, in which an output only answers requests.
+
+        Slots rest by themselves. All other calls continue, also ``can_returned``, but no frame
+        except an answer may be made, and no deadline returned for one. When quiet mode ends,
+        ``can_returned`` follows as soon as the bus works.
+        """
+
     def held_up(self, now: int) -> None:
         """Follow a suspension of the process that ended at ``now``."""
 

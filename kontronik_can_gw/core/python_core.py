@@ -10,14 +10,15 @@ from kontronik_can_gw.esc.decoder import Reading
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.plan import Layout
-from kontronik_can_gw.status import GatewayStatus
-from kontronik_can_gw.times import SECOND
+from kontronik_can_gw.status import GatewayState, GatewayStatus
+from kontronik_can_gw.times import NEVER, SECOND
 
 
 class PythonCore:
     """The core in plain Python. See ``core.interface.Core`` for its methods.
 
     With ``silent_on_loss``, messages stop while telemetry is lost (``core.messages.Messages``).
+    ``quiet_after_ns`` is the time without telemetry after which quiet mode begins, or 0.
     """
 
     language = "Python"
@@ -29,9 +30,10 @@ class PythonCore:
         layout: Layout,
         now: int,
         silent_on_loss: bool,
+        quiet_after_ns: int = 0,
     ) -> None:
         self.escs: list[EscStream] = [EscStream(settings, now) for settings in escs]
-        self.status = GatewayStatus(esc_count=len(escs), started_ns=now)
+        self.status = GatewayStatus(esc_count=len(escs), started_ns=now, heard_ns=now)
         self.messages = Messages(layout, self.escs, self.status, now, silent_on_loss)
         self.slots = Slots(self.escs, self.status)
         self.slot = self.slots.add
@@ -42,6 +44,7 @@ class PythonCore:
         self.shortest_timeout_ns = self._shortest_timeout()
         self.followers: Sequence[Follower] = ()
         self.link_changes: list[int] = []
+        self._quiet_after_ns = quiet_after_ns
         self._second_ns = now
         self._next_expiry = 0
         """No ESC has a deadline before this time. 0: not known.
@@ -89,14 +92,21 @@ class PythonCore:
         if now < self._next_expiry:
             return
         for index, esc in enumerate(self.escs):
-            if index != but and now >= esc.next_deadline():
+            if index != but and now >= self._deadline_of(esc):
                 events = esc.advance(now)
                 if events:
                     self._report(index, events, now)
-        self._next_expiry = min(esc.next_deadline() for esc in self.escs)
+        self._next_expiry = self._first_expiry()
         if now - self._second_ns >= SECOND:
             self._second_ns = now
             self.messages.on_gateway_change(now, each_second=True)
+
+    def _deadline_of(self, esc: EscStream) -> int:
+        """Return the next deadline of an ESC. In quiet mode no second of its statistics ends."""
+        return esc.expiry() if self.status.is_quiet else esc.next_deadline()
+
+    def _first_expiry(self) -> int:
+        return min([self._deadline_of(esc) for esc in self.escs])
 
     def _expired(self, esc: int, now: int) -> EscStream:
         """Drop expired values, and return the state of an ESC that takes new ones.
@@ -114,13 +124,45 @@ class PythonCore:
     def advance(self, now: int) -> None:
         if now >= self._next_expiry:
             self.expire(now)
+        if now >= self._quiet_deadline():
+            self._change_quiet(now)
+        if self.status.is_quiet:
+            return
         if now >= self.messages.next_due:
             self.messages.advance(now)
         self.slots.advance(now)
 
     def next_deadline(self) -> int:
-        due = self._next_expiry or min(esc.next_deadline() for esc in self.escs)
+        due = min(self._next_expiry or self._first_expiry(), self._quiet_deadline())
+        if self.status.is_quiet:
+            return due
         return min(due, self.messages.next_due, self.slots.next_deadline())
+
+    # --- quiet mode
+
+    def _quiet_deadline(self) -> int:
+        """Return the time at which quiet mode begins or ends."""
+        if self.status.is_quiet:
+            return self.status.heard_ns if self.status.escs_ok else NEVER
+        if not self._quiet_after_ns or self.status.escs_ok:
+            return NEVER
+        return self.status.heard_ns + self._quiet_after_ns
+
+    def _change_quiet(self, now: int) -> None:
+        """Begin quiet mode, or end it."""
+        is_quiet = self.status.is_quiet = not self.status.is_quiet
+        self._next_expiry = 0
+        before, after = GatewayState.QUIET, GatewayState.RUNNING
+        if is_quiet:
+            before, after = after, before
+        if self.status.state is before:
+            self.status.state = after
+        self.slots.set_quiet(is_quiet)
+        if is_quiet:
+            self.messages.begin_quiet(now)
+        else:
+            self.messages.end_quiet(now)
+        self._report(0, Event.QUIET, now)
 
     # --- frames
 
@@ -147,8 +189,10 @@ class PythonCore:
     def _follow_link(self, esc: int, events: int, now: int) -> None:
         if events & Event.LINK:
             self.link_changes.append(esc)
-        self._next_expiry = min(self._next_expiry, self.escs[esc].next_deadline())
+        self._next_expiry = min(self._next_expiry, self._deadline_of(self.escs[esc]))
         escs_ok = sum([each.live is not None for each in self.escs])
         if escs_ok != self.status.escs_ok:
             self.status.escs_ok = escs_ok
+            if not escs_ok:
+                self.status.heard_ns = max([each.live_ns or 0 for each in self.escs])
             self.messages.on_gateway_change(now)

@@ -182,19 +182,20 @@ class PythonSlot:
         if not self._started or settings is None:
             return
         self.is_news = True
-        if not settings.by_event or self.place in self._owner.pending:
+        owner = self._owner
+        if owner.is_quiet or not settings.by_event or self.place in owner.pending:
             return
         until = self._last_ns + settings.inhibit_ns
         if now >= until:
             self._deferred_until = NEVER
-            self._owner.mark_pending(self, now)
+            owner.mark_pending(self, now)
         elif self._deferred_until == NEVER and not settings.plan.paced:
             # A paced slot waits for the next event or its timer instead.
             self._deferred_until = until
         self._set_due()
 
     def send(self, now: int) -> None:
-        if self._started and self._settings is not None:
+        if self._started and self._settings is not None and not self._owner.is_quiet:
             self._owner.mark_pending(self, now)
 
     def on_event(self, now: int) -> None:
@@ -296,6 +297,8 @@ class Slots:
         """The slots that ``take`` sends, and the times at which they became due."""
         self.moved: set[int] = set()
         """ESCs of slots whose ``due`` changed."""
+        self.is_quiet = False
+        """True if no slot sends."""
         self._of: list[list[PythonSlot]] = [[] for _ in escs]
         self._due = [NEVER] * len(escs)
 
@@ -321,6 +324,8 @@ class Slots:
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Mark the slots that follow these events of an ESC (bits of telemetry.Event)."""
+        if self.is_quiet:
+            return
         for slot in self._of[esc]:
             if events & slot.triggers:
                 slot.on_event(now)
@@ -329,8 +334,16 @@ class Slots:
         """Mark a slot as pending."""
         self.pending.setdefault(slot.place, now)
 
+    def set_quiet(self, is_quiet: bool) -> None:
+        """Begin or end quiet mode. Slots that are pending at its begin are not sent."""
+        self.is_quiet = is_quiet
+        if is_quiet:
+            self.pending = {}
+
     def next_deadline(self) -> int:
         """Return the time at which ``advance`` must be called."""
+        if self.is_quiet:
+            return NEVER
         while self.moved:
             esc = self.moved.pop()
             self._due[esc] = min([slot.due for slot in self._of[esc]])

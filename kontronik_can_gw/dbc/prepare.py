@@ -5,8 +5,8 @@ byte order, sign, factor, offset, limits, value tables and timing are taken only
 mistakes in a DBC or its bindings are found here together, at the start.
 
 Settings that are valid but misleading cause a warning: a bus that is nearly full, flags without a
-code for "not available" in a message that does not report lost telemetry, and values that a
-protocol does not supply.
+code for "not available" in a message that does not report lost telemetry, a state of the gateway
+without Quiet, and values that a protocol does not supply.
 """
 
 from collections import Counter
@@ -23,10 +23,11 @@ from kontronik_can_gw.dbc.reader import choose_node, listed
 from kontronik_can_gw.dbc.signal_compiler import Compilation
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import Group
+from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.frames import block_of
 from kontronik_can_gw.signals.packer import has_code
 from kontronik_can_gw.signals.plan import Layout, MessagePlan, SignalPlan
+from kontronik_can_gw.status import GatewayState
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -267,6 +268,21 @@ def unreported(layout: Layout, silent_on_loss: bool) -> list[str]:
                 "of the message reports the loss. Add a signal bound to link_state, or one with "
                 f"NotAvailable in its value table{remedy}."
             )
+    return found
+
+
+def without_quiet(layout: Layout) -> list[str]:
+    """Return a warning for each signal that cannot report quiet mode."""
+    found = []
+    for message in layout.messages:
+        for signal in message.signals:
+            numbers = signal.numbers
+            is_state = signal.source is VALUES["gateway_state"]
+            if is_state and numbers is not None and GatewayState.QUIET not in numbers:
+                found.append(
+                    f"{layout.file}: {message.name}.{signal.name}: "
+                    "its value table has no Quiet, so quiet mode is sent as Error. Add it."
+                )
     return found
 
 

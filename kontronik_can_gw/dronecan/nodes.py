@@ -202,8 +202,11 @@ class Dronecan(Output):
         self._unanswered = 0
         """Number of requests that exceeded MAX_ANSWERS."""
         self._answers = 0
-        """Number of answers in the present second."""
+        """Number of answers since ``_answers_since``."""
+        self._answers_since = 0
+        """Start of the present second of answers."""
         self._second_due = NEVER
+        self._is_quiet = False
         self._news: list[LogLine] = []
         self._update_ids()
 
@@ -218,12 +221,20 @@ class Dronecan(Output):
     def stop(self, now: int) -> None:
         for report in self._reports:
             report.stop()
-        for node in self._by_id.values():
-            self._send_node_status(node, now, wire.OFFLINE)
+        if not self._is_quiet:
+            self._send_offline(now)
 
     def can_returned(self, now: int, has_lost_frames: bool = False) -> None:
         self._log_again()
         self.repeat_measurements(now)
+
+    def set_quiet(self, is_quiet: bool, now: int) -> None:
+        self._is_quiet = is_quiet
+        if is_quiet:
+            self._send_offline(now)
+        else:
+            self._ask(now)
+            self._second_due = now + SECOND
 
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
         if before is CanState.BUS_OFF and state not in (CanState.BUS_OFF, CanState.DOWN):
@@ -239,6 +250,8 @@ class Dronecan(Output):
         self._second_due = now
 
     def next_deadline(self) -> int:
+        if self._is_quiet:
+            return NEVER
         return min(self._second_due, self._allocation.due)
 
     def on_event(self, esc: int, events: int, now: int) -> None:
@@ -248,6 +261,8 @@ class Dronecan(Output):
         self._nodes[esc].is_duplicate = present
 
     def advance(self, now: int) -> None:
+        if self._is_quiet:
+            return
         if now >= self._allocation.due:
             self.frames += self._allocation.advance(now)
         due = self._second_due
@@ -277,6 +292,9 @@ class Dronecan(Output):
         request = self._assembler.receive(can_id, frame.data, kind.seed, now)
         if request is None:
             return
+        if now - self._answers_since >= SECOND:
+            self._answers_since = now
+            self._answers = 0
         if self._answers >= MAX_ANSWERS:
             self._unanswered += 1
             return
@@ -334,7 +352,6 @@ class Dronecan(Output):
 
     def _send_second(self, now: int) -> None:
         """Send the messages of each second."""
-        self._answers = 0
         for report in self._reports:
             report.update(0, now)
         for node in self._by_id.values():
@@ -350,6 +367,10 @@ class Dronecan(Output):
     def _log_again(self) -> None:
         for report in self._reports:
             report.log_again()
+
+    def _send_offline(self, now: int) -> None:
+        for node in self._by_id.values():
+            self._send_node_status(node, now, wire.OFFLINE)
 
     def _send_node_status(
         self,

@@ -53,6 +53,9 @@ class Event:
     STATE = 16
     """The operating errors or the device changed, or became known."""
     ALL = 31
+    """All events of an ESC."""
+    QUIET = 32
+    """Quiet mode of the gateway began or ended. It is reported for ESC 0."""
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ Bytes, received CAN frames and time go in. CAN frames to send and the next deadl
 
 from collections.abc import Sequence
 
-from kontronik_can_gw.core.interface import Core, Follower
+from kontronik_can_gw.core.interface import Core, Follower, OnEvent
 from kontronik_can_gw.core.output import NodeOutput, NodeState
 from kontronik_can_gw.core.output_setup import OutputMaker
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts
 from kontronik_can_gw.gateway.outage import HoldsFrames
@@ -23,6 +23,8 @@ class Gateway(HoldsFrames):
     """One gateway between several ESCs and one CAN bus.
 
     It sends the messages of the layout and the frames of ``outputs``. Each of the two may be empty.
+    Without telemetry for ``quiet_after_ns``, quiet mode begins: the gateway only answers requests.
+    0 means never.
     """
 
     is_recorded = False
@@ -35,9 +37,10 @@ class Gateway(HoldsFrames):
         now: int,
         silent_on_loss: bool = False,
         outputs: Sequence[OutputMaker] = (),
+        quiet_after_ns: int = 0,
     ) -> None:
         slots = sum([maker.slots for maker in outputs])
-        made = make_core(escs, layout, now, silent_on_loss, slots)
+        made = make_core(escs, layout, now, silent_on_loss, slots, quiet_after_ns)
         core: Core = made.core
         super().__init__(core, tuple([maker.make(core, now) for maker in outputs]), layout)
         self.why_python = made.why
@@ -49,7 +52,10 @@ class Gateway(HoldsFrames):
         self.node_outputs = [each for each in self.outputs if isinstance(each, NodeOutput)]
         self.has_outputs = bool(self.outputs)
         """False if only messages are sent. Then the ids to receive never change."""
-        self.core.followers = [Follower(each.events, each.on_event) for each in self.outputs]
+        self.core.followers = [
+            *[Follower(each.events, each.on_event) for each in self.outputs],
+            Follower(Event.QUIET, _quiet_follower(self)),
+        ]
         self.conflicts = IdConflicts(self.core.own_ids, self.outputs)
         self._being_saved: list[tuple[int, NodeOutput]] = []
         self._has_discarded = False
@@ -256,3 +262,19 @@ class Gateway(HoldsFrames):
 
     def not_sent(self, now: int) -> None:
         """Note that the frames taken last were discarded. Only a recorded gateway needs this."""
+
+
+def _quiet_follower(gateway: Gateway) -> OnEvent:
+    """Return the function that follows the begin and the end of the core's quiet mode.
+
+    After quiet mode, everything is sent as after an outage. So frames are held until ``release``.
+    """
+
+    def follow(_esc: int, _events: int, now: int) -> None:
+        is_quiet = bool(gateway.status.is_quiet)
+        for output in gateway.outputs:
+            output.set_quiet(is_quiet, now)
+        if not is_quiet:
+            gateway.is_held = True
+
+    return follow

@@ -411,9 +411,16 @@ static int64_t earlier(int64_t a, int64_t b)
     return a < b ? a : b;
 }
 
-static int64_t esc_deadline(const kcg_esc *e)
+static int is_quiet(const kcg *g)
 {
-    return earlier(e->window_ns + SECOND, earlier(end_of_live(e), end_of_info(e)));
+    return g->gateway[KCG_IS_QUIET] != 0;
+}
+
+/* Returns the next deadline of an ESC. In quiet mode no second of its statistics ends. */
+static int64_t esc_deadline(const kcg *g, const kcg_esc *e)
+{
+    int64_t expiry = earlier(end_of_live(e), end_of_info(e));
+    return is_quiet(g) ? expiry : earlier(e->window_ns + SECOND, expiry);
 }
 
 static int expire_esc(kcg_esc *e, int64_t now)
@@ -950,7 +957,7 @@ static void slot_news(kcg *g, uint32_t i, int64_t now)
     if (!(slot->state & STARTED))
         return;
     slot->state |= NEWS;
-    if (!(g->plan->message[i].flags & KCG_EVENT) || s->why)
+    if (is_quiet(g) || !(g->plan->message[i].flags & KCG_EVENT) || s->why)
         return;
     if (!may_go(g, i, now)) {
         if (!(g->plan->message[i].flags & KCG_PACED))
@@ -1085,7 +1092,7 @@ void kcg_slot_news(kcg *g, uint32_t slot, int64_t now)
 void kcg_slot_send(kcg *g, uint32_t slot, int64_t now)
 {
     uint32_t i = g->plan->messages + slot;
-    if (g->slot[slot].state & STARTED && !g->sending[i].why)
+    if (g->slot[slot].state & STARTED && !g->sending[i].why && !is_quiet(g))
         mark(g, i, now, REQUEST);
 }
 
@@ -1145,6 +1152,8 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
 {
     const kcg_plan *plan = g->plan;
     const kcg_esc *e = &g->esc[esc];
+    if (is_quiet(g))
+        return;
     /* Without live data, or when the info has just expired, there may be no later event that
        requests the further pages. */
     int has_lost_data = !e->has_live || (events & KCG_INFO && !e->has_info);
@@ -1173,6 +1182,8 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
 
 void kcg_gateway_changed(kcg *g, int each_second, int64_t now)
 {
+    if (is_quiet(g))
+        return;
     for (uint32_t i = 0; i < g->plan->messages; i++) {
         const kcg_message *m = &g->plan->message[i];
         if (m->flags & KCG_OF_THE_GATEWAY && !(each_second && m->cycle))
@@ -1182,6 +1193,8 @@ void kcg_gateway_changed(kcg *g, int each_second, int64_t now)
 
 void kcg_repeat(kcg *g, int64_t now)
 {
+    if (is_quiet(g))
+        return;
     for (uint32_t i = 0; i < g->plan->messages; i++) {
         const kcg_message *m = &g->plan->message[i];
         for (int place = 0; place < PAGES_OF(m); place++)
@@ -1193,9 +1206,9 @@ void kcg_repeat(kcg *g, int64_t now)
     }
 }
 
-void kcg_stop(kcg *g, int64_t now)
+/* Requests the messages with values of the gateway, all pages, at any distance. */
+static void send_last(kcg *g, int64_t now)
 {
-    g->stopping = 1;
     for (uint32_t i = 0; i < g->plan->messages; i++) {
         const kcg_message *m = &g->plan->message[i];
         if (!(m->flags & KCG_OF_THE_GATEWAY))
@@ -1204,6 +1217,26 @@ void kcg_stop(kcg *g, int64_t now)
             queue_all_pages(g, i);
         mark(g, i, now, REQUEST);
     }
+}
+
+void kcg_stop(kcg *g, int64_t now)
+{
+    if (is_quiet(g))
+        return;
+    g->stopping = 1;
+    send_last(g, now);
+}
+
+/* Discards all that is pending. */
+static void clear_pending(kcg *g)
+{
+    for (uint32_t k = 0; k < g->pendings; k++)
+        g->sending[g->pending[k]].why = 0;
+    g->pendings = 0;
+    for (uint32_t i = 0; i < g->plan->messages; i++)
+        g->sending[i].pages_to_send = 0;
+    for (uint32_t k = 0; k < g->plan->pages; k++)
+        g->page[k] &= KNOWN;
 }
 
 /* Handles cycles and minimum distances that are due. */
@@ -1375,7 +1408,7 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
         make_frame(g, i, now, &frames[g->taken]);
         g->taken += parts_of(m);
         g->pending[kept++] = (uint16_t)i;
-        if (KCG_PAGED && g->stopping && s->pages_to_send > 1) {
+        if (KCG_PAGED && (g->stopping || is_quiet(g)) && s->pages_to_send > 1) {
             k++; /* its other pages are next */
             break;
         }
@@ -1418,7 +1451,7 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
             }
             if (!KCG_PAGED || !s->pages_to_send)
                 continue;
-            if (g->stopping) {
+            if (g->stopping || is_quiet(g)) {
                 s->why = REQUEST;
                 g->pending[kept++] = (uint16_t)i;
                 continue;
@@ -1432,6 +1465,16 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
 
 /* --- the core (twin: core/python_core.py) ----------------------------------------------------- */
 
+/* Returns the time of the newest live frame. */
+static int64_t last_heard(const kcg *g)
+{
+    int64_t last = 0;
+    for (int i = 0; i < g->plan->escs; i++)
+        if (g->esc[i].live_ns > last)
+            last = g->esc[i].live_ns;
+    return last;
+}
+
 /* Handles events of an ESC: requests messages, and stores the events that the owner follows. */
 static void report(kcg *g, int esc, int events, int64_t now)
 {
@@ -1440,11 +1483,13 @@ static void report(kcg *g, int esc, int events, int64_t now)
     on_event(g, esc, events, now);
     if (events & (KCG_LINK | KCG_INFO)) {
         int64_t ok = 0;
-        g->next_expiry = earlier(g->next_expiry, esc_deadline(&g->esc[esc]));
+        g->next_expiry = earlier(g->next_expiry, esc_deadline(g, &g->esc[esc]));
         for (int i = 0; i < g->plan->escs; i++)
             ok += g->esc[i].has_live;
         if (ok != g->gateway[KCG_ESCS_OK]) {
             g->gateway[KCG_ESCS_OK] = ok;
+            if (!ok)
+                g->gateway[KCG_HEARD_NS] = last_heard(g);
             kcg_gateway_changed(g, 0, now);
         }
     }
@@ -1459,7 +1504,7 @@ static int64_t first_expiry(const kcg *g)
 {
     int64_t first = KCG_NEVER;
     for (int i = 0; i < g->plan->escs; i++)
-        first = earlier(first, esc_deadline(&g->esc[i]));
+        first = earlier(first, esc_deadline(g, &g->esc[i]));
     return first;
 }
 
@@ -1470,7 +1515,7 @@ static void expire(kcg *g, int64_t now, int except)
         return;
     for (int i = 0; i < g->plan->escs; i++) {
         kcg_esc *e = &g->esc[i];
-        if (i != except && now >= esc_deadline(e)) {
+        if (i != except && now >= esc_deadline(g, e)) {
             int events = expire_esc(e, now);
             if (now - e->window_ns >= SECOND)
                 events |= close_window(e, now);
@@ -1482,6 +1527,37 @@ static void expire(kcg *g, int64_t now, int except)
         g->second = now;
         kcg_gateway_changed(g, 1, now);
     }
+}
+
+/* Returns the time at which quiet mode begins or ends. */
+static int64_t quiet_deadline(const kcg *g)
+{
+    if (is_quiet(g))
+        return g->gateway[KCG_ESCS_OK] ? g->gateway[KCG_HEARD_NS] : KCG_NEVER;
+    if (!g->plan->quiet_after || g->gateway[KCG_ESCS_OK])
+        return KCG_NEVER;
+    return g->gateway[KCG_HEARD_NS] + g->plan->quiet_after;
+}
+
+/* Begins quiet mode, or ends it. */
+static void change_quiet(kcg *g, int64_t now)
+{
+    int64_t *state = &g->gateway[KCG_GATEWAY_STATE];
+    g->next_expiry = 0;
+    if (is_quiet(g)) {
+        g->gateway[KCG_IS_QUIET] = 0;
+        if (*state == KCG_STATE_QUIET)
+            *state = KCG_STATE_RUNNING;
+        kcg_gateway_changed(g, 0, now);
+        kcg_repeat(g, now);
+    } else {
+        if (*state == KCG_STATE_RUNNING)
+            *state = KCG_STATE_QUIET;
+        clear_pending(g);
+        send_last(g, now);
+        g->gateway[KCG_IS_QUIET] = 1;
+    }
+    g->quiet_changed = 1;
 }
 
 /* Processes the next stored frame. Returns 0 if there is none. */
@@ -1511,6 +1587,11 @@ int kcg_next_event(kcg *g)
             g->esc[esc].reported = 0;
             memmove(g->report, g->report + 1, --g->reports);
             return esc << 8 | events;
+        }
+        if (g->quiet_changed) {
+            g->quiet_changed = 0;
+            if (g->mask & KCG_QUIET)
+                return KCG_QUIET;
         }
         if (accept_next(g))
             continue;
@@ -1586,7 +1667,10 @@ int kcg_expire(kcg *g, int64_t now)
 int kcg_advance(kcg *g, int64_t now)
 {
     expire(g, now, -1);
-    advance_messages(g, now);
+    if (now >= quiet_deadline(g))
+        change_quiet(g, now);
+    if (!is_quiet(g))
+        advance_messages(g, now);
     return kcg_next_event(g);
 }
 
@@ -1606,8 +1690,8 @@ int kcg_port(kcg *g, int esc, int is_open, int64_t now)
 
 int64_t kcg_next_deadline(kcg *g)
 {
-    int64_t due = g->next_expiry ? g->next_expiry : first_expiry(g);
-    return g->heaped ? earlier(due, due_of(g, g->heap[0])) : due;
+    int64_t due = earlier(g->next_expiry ? g->next_expiry : first_expiry(g), quiet_deadline(g));
+    return g->heaped && !is_quiet(g) ? earlier(due, due_of(g, g->heap[0])) : due;
 }
 
 void kcg_apply(kcg *g, int esc, const kcg_settings *settings)
@@ -1640,7 +1724,7 @@ kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, 
     g->page = (uint8_t *)(g->pending + messages);
     g->report = g->page + plan->pages;
     g->plan = plan;
-    g->gateway[KCG_STARTED_NS] = g->second = now;
+    g->gateway[KCG_STARTED_NS] = g->second = g->gateway[KCG_HEARD_NS] = now;
     g->read_esc = -1;
     for (int i = 0; i < plan->escs; i++) {
         kcg_esc *e = &g->esc[i];

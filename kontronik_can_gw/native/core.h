@@ -50,11 +50,12 @@ enum { KCG_PAGES = 64 };
 
 /* Events of an ESC (twin: telemetry.Event). */
 enum {
-    KCG_LIVE = 1,      /* Live data were received, or expired. */
-    KCG_INFO = 2,      /* Info was received, or expired. */
-    KCG_LINK = 4,      /* The state of the link, the layout or the device has changed. */
-    KCG_SECOND = 8,    /* A second of the statistics has ended. */
-    KCG_NEW_STATE = 16 /* The first reading, other error bits, or another device. */
+    KCG_LIVE = 1,       /* Live data were received, or expired. */
+    KCG_INFO = 2,       /* Info was received, or expired. */
+    KCG_LINK = 4,       /* The state of the link, the layout or the device has changed. */
+    KCG_SECOND = 8,     /* A second of the statistics has ended. */
+    KCG_NEW_STATE = 16, /* The first reading, other error bits, or another device. */
+    KCG_QUIET = 32      /* Quiet mode began or ended. It is the last event of a call, of ESC 0. */
 };
 /* States of an ESC's link (twin: telemetry.LinkState). */
 enum {
@@ -95,8 +96,9 @@ enum {
     KCG_OF_DIRECTED /* As KCG_OF_LIVE, but negative while the live byte at offset `state_place` is
                        the number of a bit that is set in `negative_states`. */
 };
-/* Indices of kcg.gateway. The core writes KCG_ESCS_OK, kcg_init writes KCG_STARTED_NS, and the
-   owner writes all others. */
+/* Indices of kcg.gateway. The core writes KCG_ESCS_OK, KCG_HEARD_NS and KCG_IS_QUIET, kcg_init
+   writes KCG_STARTED_NS, and the owner writes all others. When quiet mode begins and ends, the core
+   changes KCG_GATEWAY_STATE (see kcg_plan). */
 enum {
     KCG_ESCS_OK, /* Number of ESCs with fresh live data. */
     KCG_GATEWAY_STATE,
@@ -111,7 +113,15 @@ enum {
     KCG_ID_CONFLICTS,
     KCG_STARTED_NS, /* Time of kcg_init. */
     KCG_CAN_RESTARTS,
+    KCG_HEARD_NS,   /* Last time at which an ESC was heard, or that of kcg_init. Old while there
+                       are live data. */
+    KCG_IS_QUIET,   /* 1: quiet mode, in which nothing becomes pending. */
     KCG_OF_GATEWAY_COUNT
+};
+/* Values of KCG_GATEWAY_STATE that the core knows. */
+enum {
+    KCG_STATE_RUNNING = 1,
+    KCG_STATE_QUIET = 4
 };
 /* kcg_signal.divisor. */
 enum {
@@ -258,6 +268,11 @@ typedef struct {
     uint32_t words;                        /* Length of `constant`. */
     uint16_t messages, escs, pages, slots; /* In `message`, the slots follow the messages. */
     const kcg_slot_row *slot_row;
+    /* Quiet mode begins when no ESC has had live data for this time in ns. 0: never. The messages
+       with values of the gateway are sent for the last time, and then nothing is sent. Live data
+       of an ESC end it. KCG_GATEWAY_STATE changes from KCG_STATE_RUNNING to KCG_STATE_QUIET and
+       back. */
+    int64_t quiet_after;
 } kcg_plan;
 
 /* State of an ESC. Fields that are used often are at the beginning, because the instructions of
@@ -357,6 +372,7 @@ typedef struct {
     int64_t next_expiry;   /* The earliest deadline of all ESCs; 0: unknown. */
     int64_t gateway[KCG_OF_GATEWAY_COUNT]; /* States and counters of the gateway. */
     uint8_t stopping;      /* kcg_stop was called. */
+    uint8_t quiet_changed; /* The event KCG_QUIET was not yet returned. */
     uint8_t again;         /* The last kcg_receive returned KCG_AGAIN. */
     kcg_found found[KCG_FOUND];
 } kcg;
@@ -433,8 +449,8 @@ void kcg_gateway_changed(kcg *g, int each_second, int64_t now);
 /* Requests all messages without a cycle. Call it after the start, and after frames were lost
    (bus-off). */
 void kcg_repeat(kcg *g, int64_t now);
-/* Requests the gateway's own messages for the last time. Afterwards, call kcg_take and kcg_sent
-   until kcg_take returns 0. Only kcg_init starts the core again. */
+/* Requests the gateway's own messages for the last time. In quiet mode nothing is sent. Afterwards,
+   call kcg_take and kcg_sent until kcg_take returns 0. Only kcg_init starts the core again. */
 void kcg_stop(kcg *g, int64_t now);
 /* Packs pending frames in the order in which to send them. Returns their number, which is 0 if
    nothing is pending. The frames stay pending until kcg_sent, which must be the next call, with the

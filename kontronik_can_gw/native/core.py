@@ -80,8 +80,9 @@ class NativeCore:
         now: int,
         silent_on_loss: bool,
         slots: int = 0,
+        quiet_after_ns: int = 0,
     ) -> None:
-        tables = Tables(layout, escs, silent_on_loss)
+        tables = Tables(layout, escs, silent_on_loss, quiet_after_ns)
         self._places = reserve(tables, slots)
         self.slots_of_esc = len(self._places[0])
         self.library = library
@@ -142,7 +143,7 @@ class NativeCore:
 
     def choose_events(self) -> None:
         """Let the core report the events that Python code follows."""
-        events = Event.LINK | self._slots.triggers  # always needed here
+        events = Event.LINK | Event.QUIET | self._slots.triggers  # always needed here
         for wanted, _ in self._followers:
             events |= wanted
         self.reports_live = bool(events & Event.LIVE)
@@ -292,6 +293,8 @@ class NativeCore:
     def _dispatch(self, esc: int, events: int, now: int) -> None:
         if events & Event.LINK:
             self.link_changes.append(esc)
+        if events & Event.QUIET:
+            self._slots.set_quiet(bool(self.status.is_quiet))
         for wanted, follow in self._followers:
             if events & wanted:
                 follow(esc, events, now)

@@ -33,12 +33,13 @@ def exported(
     escs: Sequence[EscSettings],
     silent_on_loss: bool,
     licence: str,
+    quiet_after_ns: int = 0,
 ) -> dict[str, str]:
     """Return the text of each file by its name.
 
     Raises NotInCore if the core in C cannot express the layout or an ESC's settings.
     """
-    tables = Tables(layout, escs, silent_on_loss)
+    tables = Tables(layout, escs, silent_on_loss, quiet_after_ns)
     core_c = (FOLDER / "core.c").read_text(encoding="utf-8")
     core_h = (FOLDER / "core.h").read_text(encoding="utf-8")
     for name, value in _options(layout, tables).items():

@@ -47,10 +47,12 @@ def make_core(
     now: int,
     silent_on_loss: bool,
     slots: int = 0,
+    quiet_after_ns: int = 0,
 ) -> Made:
     """Return the core for these ESCs and this layout.
 
     ``slots`` is the number of slots of each ESC for which the core in C has room.
+    ``quiet_after_ns`` is the time without telemetry after which quiet mode begins, or 0.
     """
     found, why = library()
     if found is not None:
@@ -58,10 +60,11 @@ def make_core(
         from kontronik_can_gw.native.rows import NotInCore
 
         try:
-            return Made(NativeCore(found, escs, layout, now, silent_on_loss, slots), "")
+            core = NativeCore(found, escs, layout, now, silent_on_loss, slots, quiet_after_ns)
+            return Made(core, "")
         except NotInCore as error:
             why = str(error)
-    return Made(PythonCore(escs, layout, now, silent_on_loss), why)
+    return Made(PythonCore(escs, layout, now, silent_on_loss, quiet_after_ns), why)
 
 
 def give_back() -> None:

@@ -224,6 +224,8 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
                 return KCG_IS_FULL;
             receive(o, (int)esc, data + TIME, length - TIME, now, (int64_t)since);
         } else if (kind == ADVANCE) {
+            if (o->core->gateway[KCG_IS_QUIET] && o->core->gateway[KCG_ESCS_OK])
+                return KCG_OTHER_ENTRY; /* Quiet mode ends, and the owner holds the frames. */
             if (is_full(o))
                 return KCG_IS_FULL;
             advance(o, now);

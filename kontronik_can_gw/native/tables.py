@@ -61,7 +61,9 @@ class Tables:
         layout: Layout,
         escs: Sequence[EscSettings],
         silent_on_loss: bool = False,
+        quiet_after_ns: int = 0,
     ) -> None:
+        self._quiet_after_ns = quiet_after_ns
         self._plans = layout.messages
         self.signals = Rows(Signal)
         self.messages = Rows(Message)
@@ -142,6 +144,7 @@ class Tables:
             "escs": len(self.settings),
             "pages": self.pages,
             "slots": slots,
+            "quiet_after": self._quiet_after_ns,
         }
 
     def _add(self, plan: MessagePlan, silent_on_loss: bool, phase: int) -> None:

@@ -35,6 +35,7 @@ def made(
     canopen: bool = False,
     of_esc: Callable[[int], dict[str, object]] = esc,
     dronecan: Mapping[str, object] | None = None,
+    quiet_after_s: int = 0,
     **dbc: object,
 ) -> tuple[CaptureSetup, Layout]:
     """Return the setup of a gateway and the layout of its messages.
@@ -42,7 +43,7 @@ def made(
     ``of_esc`` returns the configuration of an ESC without its port.
     """
     tables: dict[str, object] = {
-        "can": {"interface": "virtual"},
+        "can": {"interface": "virtual", "quiet_after_s": quiet_after_s},
         "dbc": dbc,
         "canopen": {"enabled": canopen, "self_start": True, "store": "/nonexistent/store"},
         "dronecan": dronecan or {},
@@ -73,7 +74,10 @@ class Bench:
             START,
             self.setup.dbc_settings.silent_on_loss,
             self.setup.outputs,
+            self.setup.quiet_after_ns,
         )
+        self.quiet_turns = 0
+        """Number of turns in quiet mode."""
         self._waiting = TransmitQueue()
         self._saves: list[int] = []
         self._is_open = True
@@ -96,13 +100,20 @@ class Bench:
             self.sent += [TimedFrame(now, frame) for frame in frames]
         elif frames:
             self.gateway.not_sent(now)
+        if self._is_open and self.gateway.is_held:
+            first = self.gateway.first_frame(now)
+            assert first is not None
+            self.gateway.status.sent_frames += 1
+            self.sent.append(TimedFrame(now, first))
+            self.gateway.release(now)
         self._saves += [esc for esc, _ in self.gateway.take_saves()]
 
     def live(self, seed: int, seconds: float, wild: bool = True) -> "Bench":
         """Run for a time with random events, and end.
 
         Bytes arrive in random pieces, turns are late, the bus and the ports fail and return, and a
-        master sends requests.
+        master sends requests. If the gateway has a quiet mode, the ESCs are silent for every second
+        period of two seconds.
         """
         now = self.running(seed, wild)(seconds)
         self.gateway.stop(now)
@@ -145,6 +156,8 @@ class Bench:
                     gateway.held_up(now, rng.random() < 0.5)
                 for index, esc in enumerate(escs):
                     data = b"".join(sent.wire for sent in esc.frames_until(now))
+                    if self.setup.quiet_after_ns and (now - START) // (2 * SECOND) % 2:
+                        data = b""
                     if data and open_ports[index]:
                         cut = rng.randrange(len(data) + 1)
                         for part in filter(None, (data[:cut], data[cut:])):
@@ -154,6 +167,7 @@ class Bench:
                     self._happens(rng, now, open_ports)
                 gateway.advance(now)
                 self.take(now)
+                self.quiet_turns += gateway.status.is_quiet
             return now
 
         return run

@@ -18,9 +18,11 @@ from kontronik_can_gw.capture.format import (
     read_entries,
     read_json,
 )
+from kontronik_can_gw.capture.recorded_gateway import state_of
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.desk.recordings.inputs import open_input
 
+GATEWAY_STATUS = 0x6D8
 CAPTURES = Path(__file__).resolve().parents[1] / "golden" / "captures"
 OF_0_5_0 = sorted(CAPTURES.glob("wild*.kcap"))
 
@@ -65,6 +67,34 @@ def test_frames_and_times_of_a_replay_equal_the_live_ones(
     received = sum(entry.kind == EntryKind.FRAME for entry in bench.entries)
     assert sum(frame.received for frame in frames) == received
     assert received > 3
+
+
+@pytest.mark.parametrize("nodes", [False, True])
+def test_a_replay_is_quiet_at_the_same_times_as_the_live_gateway(nodes: bool) -> None:
+    dronecan = {"enabled": nodes, "node_id": 42}
+    bench = Bench(*made(2, nodes, dronecan=dronecan, quiet_after_s=1)).live(1, 12)
+    assert bench.quiet_turns > 50
+    frames = replayed(bench)
+    assert [frame for frame in frames if not frame.received] == bench.sent
+
+
+def test_a_replay_that_begins_in_quiet_mode_is_quiet_at_once() -> None:
+    """The file before it is missing, so only the state in the header has the time."""
+    bench = Bench(*made(2, quiet_after_s=1))
+    run = bench.running(1, wild=False)
+    now = run(3.5)
+    assert bench.gateway.status.is_quiet
+    state = state_of(bench.gateway)
+    bench.entries.clear()
+    bench.sent.clear()
+    run(2)
+    found = bench.setup.database()
+    assert found is not None
+    frames = list(Replay(bench.setup.gateway(found[1], now), state).follow(bench.entries))
+    telemetry = next(sent.time_ns for sent in bench.sent)
+    before = [each.frame.can_id for each in frames if each.time_ns < telemetry]
+    assert before == [GATEWAY_STATUS]
+    assert {each.frame.can_id for each in frames} == {each.frame.can_id for each in bench.sent}
 
 
 def test_a_marked_replay_differs_only_in_the_state() -> None:

@@ -348,6 +348,10 @@ def _mappable() -> list[Variable]:
     return found
 
 
+OF_THE_CORE = ("escs_ok", "heard_ns", "is_quiet")
+"""Values of the gateway's status that the core writes."""
+
+
 class Both:
     """Both cores, which get the same calls."""
 
@@ -363,25 +367,30 @@ class Both:
         self.layout = layout
         self.silent_on_loss = chance.random() < 0.3
         self.now = START
+        self.quiet_after_ns = chance.choice((0, 30 * MS, SECOND, 10 * SECOND))
+        self.quiet_begins = 0
+        self.silent_steps = 0
+        """Number of further steps without bytes of an ESC."""
         self.events: tuple[list[Any], list[Any]] = ([], [])
         given = self.escs, self.layout, self.now, self.silent_on_loss
-        self.python = PythonCore(*given)
+        self.python = PythonCore(*given, self.quiet_after_ns)
         slots = chance.choice((0, 1, 3))
-        self.native = NativeCore(library, *given, slots)
+        self.native = NativeCore(library, *given, slots, self.quiet_after_ns)
         self.slots = []
         for esc in range(len(self.escs)):
             for _ in range(slots):
                 both = BothSlots(chance, self.python.slot(esc), self.native.slot(esc))
                 self.slots.append(both)
-        self.python.followers = [Follower(Event.ALL, lambda *event: self.events[0].append(event))]
-        self.native.followers = [Follower(Event.ALL, lambda *event: self.events[1].append(event))]
+        events = Event.ALL | Event.QUIET
+        self.python.followers = [Follower(events, lambda *event: self.events[0].append(event))]
+        self.native.followers = [Follower(events, lambda *event: self.events[1].append(event))]
         self.count = self.compared = 0
         self._tell(self.python.status)
 
     def _tell(self, status: GatewayStatus) -> None:
         """Give both cores the state of the gateway."""
         for row in GATEWAY:
-            if row == "escs_ok":
+            if row in OF_THE_CORE:
                 continue
             name = row.removeprefix("gateway_")
             for core in (self.python, self.native):
@@ -404,6 +413,7 @@ class Both:
         assert frames == others, _difference(frames, others)
         self.count += len(frames)
         assert self.events[0] == self.events[1], self.events
+        self.quiet_begins += self._compare_quiet()
         for listed in self.events:
             listed.clear()
         assert self.python.link_changes == self.native.link_changes
@@ -417,6 +427,13 @@ class Both:
         for esc, other in zip(self.python.escs, self.native.escs, strict=True):
             for name in STATE:
                 assert getattr(esc, name) == getattr(other, name), name
+
+    def _compare_quiet(self) -> bool:
+        """Compare the states of quiet mode. Return True if it has just begun."""
+        for name in ("is_quiet", "heard_ns", "state"):
+            assert getattr(self.python.status, name) == getattr(self.native.status, name), name
+        has_changed = any(events & Event.QUIET for _, events, _ in self.events[0])
+        return has_changed and self.python.status.is_quiet
 
     def run(self, steps: int) -> int:
         """Run this number of steps. Return the number of compared frames."""
@@ -437,6 +454,9 @@ class Both:
             self.now += chance.choice(_STEPS)
         else:
             self.now += chance.randrange(30 * SECOND)
+        if chance.random() < 0.01:
+            self.silent_steps = chance.randrange(60)
+        self.silent_steps = max(0, self.silent_steps - 1)
         esc = chance.randrange(len(self.escs))
         event = chance.random()
         if event < 0.1:
@@ -452,7 +472,7 @@ class Both:
             self.call("gateway_changed", self.now)
         elif event < 0.24 and self.slots:
             chance.choice(self.slots).act(self.now)
-        else:
+        elif not self.silent_steps:
             self._receive(esc)
         self.call("advance", self.now)
 
@@ -478,6 +498,13 @@ def some_escs(chance: random.Random) -> list[EscSettings]:
     return [settings(chance, n) for n in range(chance.randint(1, 3))]
 
 
+def made(library: Any, seed: int, most: int = 8) -> Both:
+    """Return both cores with a random layout. NotInCore if the C core cannot express it."""
+    chance = random.Random(seed)
+    escs = some_escs(chance)
+    return Both(library, chance, escs, layout(chance, escs, most))
+
+
 def run(
     library: Any,
     seed: int,
@@ -485,10 +512,7 @@ def run(
     most: int = 8,
 ) -> int:
     """Return the number of compared frames, or 0 for a layout that the C core cannot express."""
-    chance = random.Random(seed)
-    escs = some_escs(chance)
     try:
-        both = Both(library, chance, escs, layout(chance, escs, most))
-        return both.run(steps)
+        return made(library, seed, most).run(steps)
     except NotInCore:
         return 0

@@ -36,12 +36,15 @@ class Case:
         chance = random.Random(seed)
         self.folder = folder
         self.silent_on_loss = chance.random() < 0.3
+        self.quiet_after_ns = random.Random(seed + 1).choice((0, 300 * MS, SECOND))
         while True:
             self.escs = escs or equality.some_escs(chance)
             self.layout = layout or equality.layout(chance, self.escs)
             try:
                 licence = shipped("LICENSE").read_text(encoding="utf-8")
-                files = exported(self.layout, self.escs, self.silent_on_loss, licence)
+                files = exported(
+                    self.layout, self.escs, self.silent_on_loss, licence, self.quiet_after_ns
+                )
                 break
             except NotInCore:
                 assert layout is None
@@ -93,7 +96,7 @@ class Case:
 
     def expected(self) -> str:
         """Return the frames of the Python core with the same clock, in the format of candump."""
-        core = PythonCore(self.escs, self.layout, 0, self.silent_on_loss)
+        core = PythonCore(self.escs, self.layout, 0, self.silent_on_loss, self.quiet_after_ns)
         core.status.state = GatewayState.RUNNING
         core.status.can_state = CanState.ERROR_ACTIVE
         core.repeat(0)

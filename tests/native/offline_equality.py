@@ -77,7 +77,11 @@ def odd(chance: random.Random, last: Entry) -> Entry:
 def write_capture(chance: random.Random, path: Path, version: int = 2) -> Path:
     """Write a capture in which everything occurs. A part may be damaged."""
     nodes = chance.random() < 0.4
-    bench = Bench(*made(chance.randint(1, 3), nodes, lambda number: esc(chance, number)))
+    escs = chance.randint(1, 3)
+    setup = made(
+        escs, nodes, lambda number: esc(chance, number), quiet_after_s=chance.choice((0, 1))
+    )
+    bench = Bench(*setup)
     bench.live(chance.randrange(1000), 6)
     entries = [bench.entries[0]]
     for entry in bench.entries[1:]:

@@ -46,6 +46,18 @@ def test_both_cores_are_equal_over_a_million_frames(native_library: Any, group: 
     assert sum(counts) > 15_000
 
 
+def test_both_cores_are_equal_in_quiet_mode(native_library: Any) -> None:
+    begins = 0
+    for seed in range(60):
+        try:
+            both = equality.made(native_library, seed)
+        except NotInCore:
+            continue
+        both.run(300)
+        begins += both.quiet_begins
+    assert begins > 60, "quiet mode hardly begins"
+
+
 def _scaled(chance: random.Random) -> str:
     """Return a message whose signal has a factor of many digits.
 

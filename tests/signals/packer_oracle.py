@@ -90,7 +90,7 @@ STATES = sheet.OPERATING_STATES
 DEVICES = sheet.DEVICES
 LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
 LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
-GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay")))
+GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay", "Quiet")))
 CAN_STATES = dict(
     enumerate(("Unknown", "ErrorActive", "ErrorWarning", "ErrorPassive", "BusOff", "Down"))
 )

@@ -290,6 +290,9 @@ GATEWAY_STATES: Mapping[GatewayState, Text] = {
     GatewayState.RUNNING: Text("running"),
     GatewayState.STOPPING: Text("shutting down"),
     GatewayState.REPLAY: Text("the values come from a recording, not from an ESC"),
+    GatewayState.QUIET: Text(
+        "no ESC was heard for can.quiet_after_s, so only requests are answered until one is heard"
+    ),
 }
 
 

@@ -181,12 +181,12 @@ class CaptureInput(PlayedInput):
             while (kind := player.next_kind) is not None:
                 # waiting frames may still be dropped by an entry that the player does not play
                 if in_python or (replay.frames_wait and kind not in _PLAYED):
-                    if kind != EntryKind.NOT_SENT:
-                        in_python = kind != EntryKind.ADVANCE or replay.gateway.is_held
                     entry = entry_at(payload, *player.skip())
                     checked = self._checked(entry)
-                    if checked is not None:
-                        yield replay.play(checked)
+                    frames = [] if checked is None else replay.play(checked)
+                    if kind != EntryKind.NOT_SENT:
+                        in_python = kind != EntryKind.ADVANCE or replay.gateway.is_held
+                    yield frames
                 else:
                     yield replay.finish()
                     in_python, self._last_ns = player.play(self._last_ns)

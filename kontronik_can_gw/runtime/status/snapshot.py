@@ -335,7 +335,7 @@ _UNITS = json.dumps(
 )
 """The units as text in ASCII. A document in ASCII is converted to bytes most quickly."""
 _FURTHER_COUNTERS = ("suspect_frames", "late_frames", "line_errors")
-_NO_COUNTERS = ("esc_count", "escs_ok", "started_ns")
+_NO_COUNTERS = ("esc_count", "escs_ok", "started_ns", "heard_ns")
 _STATUS_COUNTERS = tuple(
     field.name
     for field in fields(GatewayStatus)
