@@ -185,6 +185,8 @@ class Housekeeping:
         """Return the states of the interface and the ESCs in one line."""
         state = name_in_words(self._gateway.status.can_state.name)
         words = [f"CAN {self._can.config.channel} {state}"]
+        if self._gateway.status.is_quiet:
+            words.append("quiet")
         words += [
             f"{esc.settings.name}: telemetry {name_in_words(esc.link.name)}"
             for esc in self._gateway.escs

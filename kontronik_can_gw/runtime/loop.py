@@ -38,6 +38,8 @@ _WAKES_PER_TIMEOUT = 4
 A value may expire early by this part of the time-out. The loop wakes a millisecond earlier than
 that, because a wait is rounded up to a millisecond.
 """
+_QUIET_PERIOD_NS = SECOND
+"""Longest wait in quiet mode. Without telemetry, no value can expire."""
 _LAST_SAVE_S = 0.2
 
 
@@ -163,6 +165,8 @@ class Loop:
     def turn(self) -> None:
         """Wait until a descriptor is ready or work is due, and do the work."""
         period = self.gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
+        if self.gateway.status.is_quiet:
+            period = _QUIET_PERIOD_NS
         ready = None
         if self._poller.is_native:
             leave = self._housekeeping.due  # what the controller says is asked for with it

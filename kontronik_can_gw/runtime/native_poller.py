@@ -151,11 +151,14 @@ class NativePoller(Poller):
         request = turns.request
         event, now = turns.result.event, turns.times.now
         revision = gateway.revision
+        was_quiet = gateway.status.is_quiet
         if is_due := event == OUTPUTS:
             gateway.advance(now, with_core=False)
         else:
             core.dispatch(event, now)
         if core.link_changes or core.reports_live or gateway.revision != revision:
+            return False
+        if gateway.status.is_quiet != was_quiet:
             return False
         request.outputs_due = outputs_due = gateway.next_deadline(with_core=False)
         request.due = due = min(request.due, core.deadline_in_python())

@@ -30,7 +30,7 @@ from kontronik_can_gw.runtime.status.facts import (
 )
 from kontronik_can_gw.runtime.status.snapshot import STALE_NS
 from kontronik_can_gw.runtime.system import folders
-from kontronik_can_gw.status import CanState
+from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import SECOND
 
 Document = dict[str, Any]
@@ -109,6 +109,18 @@ def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
     assert seen.code == TROUBLE
     assert seen.sentence == "running, 1 fault"
     assert seen.troubles[0].startswith("esc2: no bytes: ESC off")
+
+
+def test_missing_telemetry_is_no_fault_in_quiet_mode() -> None:
+    bench = heard()
+    bench.silent = {0, 1}
+    bench.run(2)
+    bench.gateway.status.state = GatewayState.QUIET
+    ports = [PortFacts(name, "/dev/a", True, diagnosis="no bytes") for name in ("esc1", "esc2")]
+    seen = judged(bench.document(ports=ports))
+    assert (seen.code, seen.sentence) == (HEALTHY, "quiet")
+    seen = judged(bench.document(ports=[LOST, *ports[1:]]))
+    assert (seen.code, seen.sentence) == (TROUBLE, "quiet, 1 fault")
 
 
 ACTIVE = CanState.ERROR_ACTIVE

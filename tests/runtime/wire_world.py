@@ -431,6 +431,7 @@ def loop_in(
     layout: Layout | None = None,
     notifier: Notifier | None = None,
     outputs: Sequence[OutputMaker] = (),
+    quiet_after_s: int = 0,
 ) -> Loop:
     """Return a loop whose ports, bus and time are the World's. It is not open yet."""
 
@@ -447,8 +448,10 @@ def loop_in(
     if in_c:
         patch.setattr(load, "library", lambda: (native_world.library(), ""))
     layout = layout or layout_of(escs)
-    gateway = Gateway(escs, layout, world.now, outputs=outputs)
-    config = CanConfig(interface="virtual", channel="world")
+    config = CanConfig(interface="virtual", channel="world", quiet_after_s=quiet_after_s)
+    gateway = Gateway(
+        escs, layout, world.now, outputs=outputs, quiet_after_ns=config.quiet_after_ns
+    )
     paths = list(by_path)
     poller = native_world.FakeNativePoller(world, gateway) if in_c else world.poller
     return Loop(

@@ -212,9 +212,12 @@ def _troubles(document: Document) -> Iterator[str]:
         yield can["complaint"] or f"{channel} is bus-off"
     elif can["stalled"]:
         yield can["complaint"] or f"{channel}: no frame can be sent"
+    is_quiet = document["gateway"]["state"] == "quiet"
     for esc in document["escs"]:
         port = esc["port"]
         reason = esc["diagnosis"]
+        if is_quiet and port["open"]:
+            continue  # a parked vehicle has no telemetry
         if not port["open"]:
             lost = port["lost_for_s"]
             since = "" if lost is None else f" for {duration(round(lost * SECOND))}"

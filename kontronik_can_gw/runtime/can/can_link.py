@@ -19,6 +19,7 @@ from kontronik_can_gw.runtime.can.can_opener import CanOpener
 from kontronik_can_gw.runtime.can.can_port import CanPort
 from kontronik_can_gw.runtime.can.interface_restart import InterfaceRestart
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.can.quiet_mode import QuietMode
 from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.can.transmitter import Transmitter
 from kontronik_can_gw.runtime.poller import Poller
@@ -60,6 +61,7 @@ class CanLink:
         self._conditions = conditions
         self.condition = f"CAN {config.channel}: interface"
         self.opening_condition = f"CAN {config.channel}: opening"
+        self._quiet = QuietMode(config, gateway, self.transmitter, conditions)
         self._opening_since: int | None = None
         """Start of the opening by the opener's thread. None if the thread does not open."""
         self._clock = clock
@@ -88,7 +90,7 @@ class CanLink:
         Except in bus-off the loop asks the controller in any of its turns, and need not wake up
         for that.
         """
-        due = self.transmitter.due
+        due = min(self.transmitter.due, self._quiet.due)
         if self.controller.is_off:
             due = min(due, self.controller.due)
         if self._retry.due is not None:
@@ -189,6 +191,8 @@ class CanLink:
         text = f"CAN {self.config.interface} {self.config.channel} is open"
         if self._conditions.is_on(self.opening_condition):
             self._conditions.end(self.opening_condition, text, now)
+        elif self._gateway.status.is_quiet:
+            self._conditions.end(self.condition, text, now)
         elif not self._conditions.is_on(self.condition):
             # After a failure, the recovery is logged when the first frame is sent.
             self._conditions.log(logging.INFO, text)
@@ -288,8 +292,8 @@ class CanLink:
 
         In bus-off frames are held, because they would be lost, or sent late after the restart.
         """
-        port = self.port
-        transmitter = self.transmitter
+        port, transmitter = self.port, self.transmitter
+        self._quiet.follow(now)
         if port is None or self.controller.is_off:
             transmitter.hold(now)
             transmitter.forget_failures()
@@ -297,7 +301,8 @@ class CanLink:
             if port is not None and off_since is not None:
                 self._restart.follow(off_since, now)
             return
-        answer = transmitter.transmit(port, now)
+        is_silent = self._quiet.is_silent(port, now)
+        answer = None if is_silent else transmitter.transmit(port, now)
         self._restart.follow(transmitter.outage_since, now)
         if answer is None:
             return

@@ -168,8 +168,11 @@ class Transmitter:
         self.put(frames)  # counts them as lost
         self.clear()
         gateway.hold(now)
-        if was_held:
-            return
+        if not was_held:
+            self.begin_outage(since, now)
+
+    def begin_outage(self, since: int, now: int) -> None:
+        """Follow the gateway, which holds its frames from now on. ``since``: time of the cause."""
         self._held_since = since
         self._discard_due = now + LASTING_BUSY_NS
         self._first_frame_at = None
@@ -181,7 +184,7 @@ class Transmitter:
         period_ns = self.check_period_ns
         has_left = departures.check(port.frames_left(), now, period_ns)
         if self._has_first_frame_left(has_left, now):
-            self._release(now)
+            self.release(now)
             return None
         if self._held_since is None:
             self._held_since = now
@@ -202,7 +205,7 @@ class Transmitter:
     def _send_first_frame(self, port: CanPort, now: int) -> Sent | None:
         frame = self._gateway.first_frame(now)
         if frame is None:
-            self._release(now)
+            self.release(now)
             return None
         count, answer = port.send_all((frame,), self._clock, now + self.max_turn_ns())
         if not count:
@@ -223,7 +226,7 @@ class Transmitter:
         self.due = now + BUSY_RETRY_NS
         has_left = departures.check(port.frames_left(), now, self.check_period_ns)
         if not departures.count or self._has_first_frame_left(has_left, now):
-            self._release(now)
+            self.release(now)
         return answer
 
     def _has_first_frame_left(self, has_left: bool, now: int) -> bool:
@@ -241,7 +244,7 @@ class Transmitter:
             return True
         return self._moves_since is not None and now - self._moves_since >= SOON_NS
 
-    def _release(self, now: int) -> None:
+    def release(self, now: int) -> None:
         """Send everything again."""
         self.due = NEVER
         self._held_since = None
