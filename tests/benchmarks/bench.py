@@ -28,6 +28,7 @@ BENCHMARKS = {
     "offline-capture": offline.captures,
     "offline-log": offline.can_logs,
     "offline-bytes": offline.plain_bytes,
+    "quiet": live.quiet,
     "start": live.start,
     "memory": live.memory,
 }

@@ -6,9 +6,10 @@ import socket
 import subprocess
 import tempfile
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from programs import (
     CANOPEN,
@@ -19,6 +20,7 @@ from programs import (
     Context,
     Figure,
     Measured,
+    cpu_ns,
     median,
     new_bus,
     once,
@@ -173,27 +175,93 @@ def delay_full(context: Context) -> list[Figure]:
 
 def first_frame_ms(escs: int, config: str) -> float:
     """Start the gateway on a new bus, wait for its first frame, and end it. Returns ms."""
-    bus = new_bus()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kontronik-bench-")))
-        ports = [stack.enter_context(PtyEsc()).path for _ in range(escs)]
-        family = socket.AF_UNIX, socket.SOCK_SEQPACKET
-        listener = stack.enter_context(socket.socket(*family))
-        listener.bind("\0" + bus)
-        listener.listen(1)
-        listener.settimeout(_PATIENCE_S)
-        file = write_config(folder, ports, SHIPPED, config)
-        command = standin(bus, "ours", "run", "-c", file)
-        log = stack.enter_context((folder / "errors").open("w"))
-        begun = time.perf_counter()
-        stack.enter_context(started(command, stdin=subprocess.DEVNULL, stderr=log, env=ENVIRONMENT))
-        try:
-            frames = stack.enter_context(listener.accept()[0])
-            frames.settimeout(_PATIENCE_S)
-            frames.recv(128)
-        except TimeoutError:
-            raise RuntimeError(f"no frame came: {(folder / 'errors').read_text()}") from None
-        return (time.perf_counter() - begun) * 1e3
+        gateway = silent_gateway(stack, folder, escs, config)
+        return gateway.first_frame_ms
+
+
+class Silent(NamedTuple):
+    """A gateway that has sent its first frame, and hears no ESC."""
+
+    process: "subprocess.Popen[str]"
+    frames: socket.socket
+    """Returns the frames that the gateway sends."""
+    first_frame_ms: float
+    """Time from its start to the first frame."""
+
+
+def silent_gateway(stack: ExitStack, folder: Path, escs: int, config: str, can: str = "") -> Silent:
+    """Start a gateway on a new bus, and wait for its first frame. It ends with ``stack``."""
+    bus = new_bus()
+    ports = [stack.enter_context(PtyEsc()).path for _ in range(escs)]
+    family = socket.AF_UNIX, socket.SOCK_SEQPACKET
+    listener = stack.enter_context(socket.socket(*family))
+    listener.bind("\0" + bus)
+    listener.listen(1)
+    listener.settimeout(_PATIENCE_S)
+    file = write_config(folder, ports, SHIPPED, config, can)
+    command = standin(bus, "ours", "run", "-c", file)
+    log = stack.enter_context((folder / "errors").open("w"))
+    begun = time.perf_counter()
+    streams = {"stdin": subprocess.DEVNULL, "stderr": log, "env": ENVIRONMENT}
+    process = stack.enter_context(started(command, **streams))
+    try:
+        frames = stack.enter_context(listener.accept()[0])
+        frames.settimeout(_PATIENCE_S)
+        frames.recv(128)
+    except TimeoutError:
+        raise RuntimeError(f"no frame came: {(folder / 'errors').read_text()}") from None
+    return Silent(process, frames, (time.perf_counter() - begun) * 1e3)
+
+
+_QUIET = "quiet_after_s = 1"
+_SETTLED_S = 3.0
+"""Time from the first frame until quiet mode has begun, and the start is over."""
+
+
+def silent_us(context: Context, escs: int, config: str, can: str) -> float:
+    """Return the CPU time in a second of a gateway that hears no ESC, in us."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kontronik-bench-")))
+        gateway = silent_gateway(stack, folder, escs, config, can)
+        drain(gateway.frames, _SETTLED_S)
+        before = cpu_ns(gateway.process.pid)
+        since = time.monotonic_ns()
+        count = drain(gateway.frames, context.seconds)
+        used = cpu_ns(gateway.process.pid) - before
+        took = time.monotonic_ns() - since
+    if bool(count) == bool(can):
+        raise RuntimeError(f"{count} frames were sent")
+    return used * 1e6 / took
+
+
+def drain(frames: socket.socket, seconds: float) -> int:
+    """Read frames for this time. Returns their number."""
+    count = 0
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        frames.settimeout(left)
+        with suppress(TimeoutError):
+            count += bool(frames.recv(128))
+    return count
+
+
+def quiet(context: Context) -> list[Figure]:
+    """CPU time without telemetry, in quiet mode and without it, by turns."""
+    figures = []
+    cases = {"1 ESC": (1, ""), "8 ESCs, CANopen": (8, CANOPEN)}
+    for name, (escs, config) in cases.items():
+        found: dict[str, list[float]] = {"": [], _QUIET: []}
+        for _ in range(context.rounds):
+            for can, times in found.items():
+                times.append(silent_us(context, escs, config, can))
+        pairs = zip(found[_QUIET], found[""], strict=True)
+        ratios = [one / other for one, other in pairs]
+        figures.append(Figure(f"idle, {name}", median(found[""]), "us/s"))
+        figures.append(Figure(f"quiet, {name}", median(found[_QUIET]), "us/s"))
+        figures.append(Figure(f"quiet / idle, {name}", median(ratios), "x", "<= 0.5"))
+    return figures
 
 
 def start(context: Context) -> list[Figure]:

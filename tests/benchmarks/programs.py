@@ -133,12 +133,14 @@ def write_config(
     ports: Sequence[str],
     dbc: Path,
     further: str = "",
+    can: str = "",
 ) -> Path:
     """Write the gateway's configuration.
 
     The bus load is compared with its 1 Mbit/s. ``further`` has more lines, with tables at the end.
+    ``can`` has more lines of [can].
     """
-    lines = ['[can]\ninterface = "socketcan"\nchannel = "lo"\nbitrate = 1000000']
+    lines = [f'[can]\ninterface = "socketcan"\nchannel = "lo"\nbitrate = 1000000\n{can}']
     status_folder = STATUS_FOLDER if STATUS_FOLDER.is_dir() else folder
     status = status_folder / f"{folder.name}.json"
     lines += [f'[dbc]\nfile = "{dbc}"', further, f'[statistics]\nfile = "{status}"']
@@ -179,7 +181,7 @@ class Measured(NamedTuple):
         return self.result["lost"] / self.frames if self.frames else 0.0
 
 
-def _cpu_ns(pid: int) -> int:
+def cpu_ns(pid: int) -> int:
     """Return the CPU time of all threads of a process."""
     total = 0
     for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -245,10 +247,10 @@ def once(
             return found
 
         begun = heard()["begin"]
-        before = _cpu_ns(gateway.pid)
+        before = cpu_ns(gateway.pid)
         since = time.monotonic_ns()
         frames = max(1, heard()["end"] - begun)
-        used = _cpu_ns(gateway.pid) - before
+        used = cpu_ns(gateway.pid) - before
         took = time.monotonic_ns() - since
         if not used:
             raise LeftOut("this kernel counts CPU time by ticks, too coarse to compare")
