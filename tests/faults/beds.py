@@ -80,6 +80,11 @@ def everything(folder: Path) -> contextlib.AbstractContextManager[Bench]:
     return bench_of(prefix=WITHOUT_OVERRIDE, more=record + dronecan)
 
 
+def parked(_: Path) -> contextlib.AbstractContextManager[Bench]:
+    """Return the bench of ``two`` with a quiet mode."""
+    return bench_of(prefix=WITHOUT_OVERRIDE, can="quiet_after_s = 2\n")
+
+
 def eight(_: Path) -> contextlib.AbstractContextManager[Bench]:
     """Return a bench with eight slow ESCs. Feeder and judge need the processor, too."""
     layouts = (WireLayout.V4, WireLayout.LEGACY)

@@ -11,11 +11,13 @@ import time
 from collections.abc import Iterator
 from functools import partial
 
-from beds import ADAPTER_RATE, BUS, adapters, eight, fault, make_pair, run
+from beds import ADAPTER_RATE, BUS, adapters, eight, fault, make_pair, parked, run
 from bus_watch import SECOND
 from harness import Bench, Injection, PtyPort
 from raw_bus import ERROR_FLAG, RawBus
 from slcan_adapters import Adapter
+
+from kontronik_can_gw.status import GatewayState
 
 CONFLICT = 0x8150
 traffic = partial(
@@ -95,6 +97,26 @@ def bus_off(bench: Bench, injection: Injection, _n: int) -> None:
     injection.wait_recovery()
     boot_ups(injection)
     injection.wait_emergency(1, BUS_OFF_LEFT)
+
+
+@on_cable("parked: all ESCs off and on, no frame in between", bed=parked, rounds=(3, 60))
+def park(bench: Bench, injection: Injection, seconds: float) -> None:
+    for esc in bench.escs:
+        esc.on = False
+    bench.wait_log("quiet: no ESC was heard", len(bench.gateway.lines))
+    with RawBus(bench.watched) as far:
+        while far.receive(0.2):
+            pass
+        found = far.receive(seconds)
+        bench.expect(found is None, f"{found} was sent in quiet mode")
+    state = bench.watch.value("GatewayStatus", "gateway_state")
+    bench.expect(state == GatewayState.QUIET, f"the last state is {state}")
+    still_answers(bench)
+    injection.cleared()
+    for esc in bench.escs:
+        esc.on = True
+    injection.wait_recovery()
+    boot_ups(injection)
 
 
 @contextlib.contextmanager

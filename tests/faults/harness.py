@@ -187,7 +187,8 @@ class Bench:
     """One gateway and everything that runs around it.
 
     ``interface`` is the gateway's interface. The judge receives at ``watched``, its far end.
-    With ``canopen`` there is a node for each ESC. ``more`` has further tables of the configuration.
+    With ``canopen`` there is a node for each ESC. ``can`` has further keys of [can], and ``more``
+    further tables of the configuration.
     """
 
     said_instead: str | None = None
@@ -202,6 +203,7 @@ class Bench:
         *,
         slack_ns: int = 60 * MS,
         canopen: bool = True,
+        can: str = "",
         more: str = "",
         store: Path | None = None,
         prefix: Sequence[str] = (),
@@ -215,7 +217,7 @@ class Bench:
         self.config = self.folder / "gateway.toml"
         self.prefix = tuple(prefix)
         self.environment = dict(environment or {})
-        self.config.write_text(self._configuration(canopen) + more)
+        self.config.write_text(self._configuration(canopen, can) + more)
         self.watch = BusWatch(watched, table, self.escs, slack_ns=slack_ns).start()
         self.feeder = Feeder(self.escs).start()
         self._gateway: Gateway | None = None
@@ -223,8 +225,9 @@ class Bench:
         self._received = 0
         self._excluded: list[list[tuple[int, int]]] = [[] for _ in escs]
 
-    def _configuration(self, canopen: bool) -> str:
+    def _configuration(self, canopen: bool, can: str) -> str:
         text = f'[can]\ninterface = "socketcan"\nchannel = "{self.interface}"\nbitrate = 1000000\n'
+        text += can
         if canopen:
             text += "[canopen]\nenabled = true\nself_start = true\nnode_id = 1\nserial = 1050112\n"
             text += f'store = "{self.store}"\n'
