@@ -5,6 +5,7 @@ can be typed as they are written, on any machine. Those that need a CAN interfac
 """
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -205,3 +206,41 @@ def test_each_block_states_why_it_cannot_be_run() -> None:
     assert {block.word for block in blocks()} <= set(WORDS)
     assert len(blocks()) == ALL.count("\n```sh")
     assert "```bash" not in ALL
+
+
+@pytest.mark.parametrize(
+    ("gateways", "is_suspended"),
+    [
+        ([(0, "quiet")], True),
+        ([(0, "quiet"), (0, "quiet")], True),
+        ([], False),
+        ([(0, "running")], False),
+        ([(1, "quiet")], False),
+        ([(0, "quiet"), (0, "running")], False),
+        ([(0, "quiet"), (3, "quiet")], False),
+    ],
+)
+def test_the_script_suspends_the_board_only_if_all_gateways_are_quiet(
+    tmp_path: Path, gateways: list[tuple[int, str]], is_suspended: bool
+) -> None:
+    if shutil.which("jq") is None:
+        pytest.skip(f"no jq: sudo apt-get install {NEEDS['jq']}")
+    (script,) = [block.text for block in blocks("systemd") if "#!/bin/sh" in block.text]
+    found = []
+    for code, state in gateways:
+        found.append({"exit_code": code, "document": {"gateway": {"state": state}}})
+    (tmp_path / "status.json").write_text(json.dumps({"gateways": found}))
+    programs = {
+        "kontronik-can-gw": f"cat {tmp_path}/status.json",
+        "systemctl": f'echo "$@" >{tmp_path}/done',
+        "suspend": script,
+    }
+    for name, text in programs.items():
+        program = tmp_path / name
+        program.write_text(text if text is script else f"#!/bin/sh\n{text}\n")
+        program.chmod(0o755)
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    subprocess.run([tmp_path / "suspend"], env={"PATH": path}, check=True)
+    done = tmp_path / "done"
+    assert done.exists() is is_suspended
+    assert not is_suspended or done.read_text() == "suspend\n"
