@@ -153,6 +153,7 @@ class _Named(argparse.Action):
 CONFIG_PLACES = (Path("gateway.toml"), Path("/etc/kontronik-can-gw/gateway.toml"))
 """The places of the default configuration, in the order in which they are tried."""
 _DEFAULTS = " or ".join(map(str, CONFIG_PLACES))
+_NONE_EXISTS = f"neither {' nor '.join(map(str, CONFIG_PLACES))} exists"
 CONFIG = (
     option("-c --config FILE", f"TOML configuration (default: {_DEFAULTS})", type=Path),
     option("config FILE", "TOML configuration, as with -c", type=Path, nargs="?", action=_Named),
@@ -186,7 +187,7 @@ def config_file(given: Path | None) -> Path:
     found = given or default_config()
     if found is None:
         raise UserError(
-            f"no configuration: neither {CONFIG_PLACES[0]} nor {CONFIG_PLACES[1]} exists. "
+            f"no configuration: {_NONE_EXISTS}. "
             "Give one with -c FILE, or write an example with kontronik-can-gw init."
         )
     return found
