@@ -7,14 +7,22 @@ import argparse
 import platform
 import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.assembly.assemble import Loaded, assemble
 from kontronik_can_gw.assembly.this_machine import parameter_folder
-from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file
+from kontronik_can_gw.cli.arguments import (
+    CONFIG,
+    CONFIG_PLACES,
+    FORCE,
+    JSON,
+    config_file,
+    default_config,
+    option,
+)
 from kontronik_can_gw.cli.common import show
 from kontronik_can_gw.cli.recording import record_folder
 from kontronik_can_gw.config.keys import Config
@@ -33,20 +41,38 @@ from kontronik_can_gw.runtime.can.open_can import check_interface
 
 _GAP = " " * 11
 """Indentation of the further lines of a finding."""
-OPTIONS = (CONFIG, JSON)
+OPTIONS = (
+    CONFIG,
+    (
+        JSON,
+        option("--parcel FILE", "write a zip file for support, without passwords and keys"),
+    ),
+    option("--without-captures", "leave captures out of the parcel"),
+    option("--without-dbc", "leave the DBC out of the parcel, also out of its captures"),
+    FORCE,
+)
 EPILOG = (
     "It changes nothing, and sends nothing to the bus or to an ESC, so you can call it while the "
     "gateway runs. "
     "It has the permissions of its user. To check the permissions of the service, run it as the "
     "service's user "
     "(sudo -u kontronik-can-gw). Root sees more. "
-    "Exit codes: 0 no error, perhaps warnings; 1 errors; 2 the configuration cannot be used."
+    "Exit codes: 0 no error, perhaps warnings; 1 errors; 2 the configuration cannot be used. "
+    "With --parcel: 0 the file was written, 1 it was not."
 )
 
 
 def main(args: argparse.Namespace) -> int:
+    machine = Machine()
+    if args.parcel is not None:
+        from kontronik_can_gw.cli.parcel import write_parcel
+
+        # support needs the parcel even if there is no configuration
+        config = args.config or default_config() or CONFIG_PLACES[-1]
+        findings, _ = examine(machine, config)
+        return write_parcel(args, machine, config, findings, report_lines)
     config = config_file(args.config)
-    findings, code = examine(Machine(), config)
+    findings, code = examine(machine, config)
     if args.json:
         document = {
             "format": 1,
@@ -59,7 +85,8 @@ def main(args: argparse.Namespace) -> int:
         }
         print(printable_json(document, indent=2))
     else:
-        _show(findings)
+        for line in report_lines(findings):
+            show(line)
     return code
 
 
@@ -143,29 +170,27 @@ def _folders(machine: Machine, findings: Findings, config: Config, unit: Unit | 
             check_folder(machine, findings, use, str(path), own, min_free)
 
 
-def _show(findings: Sequence[Finding]) -> None:
-    """Print the report in 80 columns. Commands are not wrapped, so that they can be copied."""
+def report_lines(findings: Sequence[Finding]) -> Iterator[str]:
+    """Yield the report in 80 columns. Commands are not wrapped, so that they can be copied."""
     group = ""
     for finding in findings:
         if finding.group != group:
             group = finding.group
-            show(group)
-        _show_wrapped(f"  {finding.severity:<9}", finding.text)
-        _show_wrapped(f"{_GAP}-> ", finding.remedy)
+            yield group
+        yield from _wrapped(f"  {finding.severity:<9}", finding.text)
+        yield from _wrapped(f"{_GAP}-> ", finding.remedy)
         if finding.command:
-            show(f"{_GAP}$ {finding.command}")
+            yield f"{_GAP}$ {finding.command}"
     counts = []
     for severity in ("error", "warning", "note"):
         number = count(findings, severity)
         noun = severity if number == 1 else f"{severity}s"
         counts.append(f"{number or 'no'} {noun}")
-    show(", ".join(counts))
+    yield ", ".join(counts)
 
 
-def _show_wrapped(first: str, text: str) -> None:
-    """Print a text after ``first``, with its further lines indented."""
-    lines = textwrap.wrap(
+def _wrapped(first: str, text: str) -> list[str]:
+    """Return the lines of a text after ``first``, with its further lines indented."""
+    return textwrap.wrap(
         text, 80, initial_indent=first, subsequent_indent=_GAP, break_on_hyphens=False
     )
-    for line in lines:
-        show(line)

@@ -8,15 +8,18 @@ import io
 import json
 import os
 import subprocess
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from feeder import Identity
 from harness import PtyPort
 from slcan_adapters import Adapter, Bus
-from vcan_tools import configuration, ip, recording, wait_for
+from vcan_tools import chain, configuration, ip, recording, wait_for
 
+from kontronik_can_gw.capture.format import Block, Damage, Scanner
 from kontronik_can_gw.cli import main
 
 
@@ -119,3 +122,37 @@ def test_bit_rate_and_state_of_a_real_driver_are_judged(
 def shown(name: str) -> str:
     command = ["ip", "-d", "link", "show", name]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def test_a_parcel_of_a_running_gateway_has_its_state_and_a_capture(
+    vcan: str,
+    tmp_path: Path,
+) -> None:
+    """The capture is still being written. Its copy can be converted."""
+    record = f'[record]\ndirectory = "{tmp_path}/captures"'
+    with chain(vcan, tmp_path, Identity(1), toml=record) as run, run.running() as gateway:
+        run.feed(times=20)
+        wait_for(lambda: data_blocks(tmp_path / "captures") > 0, "data in the capture")
+        parcel = tmp_path / "parcel.zip"
+        messages = io.StringIO()
+        with contextlib.redirect_stderr(messages):
+            assert main(["doctor", "-c", str(run.config), "--parcel", str(parcel)]) == 0
+        assert "status:" not in messages.getvalue()
+        with zipfile.ZipFile(parcel) as found:
+            found.extractall(tmp_path / "out")
+        status = json.loads((tmp_path / "out/status.json").read_text())
+        assert gateway.end() == 0, gateway.log
+    [seen] = status["gateways"]
+    assert seen["document"]["escs"][0]["name"] == "esc1"
+    [capture] = (tmp_path / "out/captures").iterdir()
+    assert main(["convert", str(capture), str(tmp_path / "out.csv"), "-q"]) == 0
+    assert len((tmp_path / "out.csv").read_text().splitlines()) > 1
+
+
+def data_blocks(folder: Path) -> int:
+    """Return the number of data blocks in all captures of a folder."""
+    scanner = Scanner()
+    found: list[Block | Damage] = []
+    for path in folder.glob("*.kcap"):
+        found += scanner.feed(path.read_bytes())
+    return sum(isinstance(each, Block) and each.kind == b"D" for each in found)

@@ -103,6 +103,13 @@ class Machine:
 
         Empty if the program is missing or takes too long.
         """
+        return self.outputs(*command)[0]
+
+    def outputs(self, *command: str, patience_s: float = _PATIENCE_S) -> tuple[str, str | None]:
+        """Return the standard output and the standard error of a program.
+
+        The second is None if the program is missing or takes too long.
+        """
         path = os.environ.get("PATH", os.defpath)
         path += ":/usr/sbin:/sbin"  # contains `ip`, and is missing in the PATH of some users
         env = os.environ | {"LC_ALL": "C", "PATH": path}
@@ -111,11 +118,11 @@ class Machine:
                 command,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
-                timeout=_PATIENCE_S,
+                timeout=patience_s,
                 env=env,
             )
-            return done.stdout.decode("utf-8", "replace")
-        return ""
+            return done.stdout.decode("utf-8", "replace"), done.stderr.decode("utf-8", "replace")
+        return "", None
 
     @cached_property
     def user(self) -> str:
