@@ -16,7 +16,10 @@ JSON keys of the header::
     outputs          the other outputs by name, each with table (as in the configuration),
                      identity, version and seed. Missing in captures of 0.5.0
 
-The recorder adds created_ns, run, part, monotonic_ns, wall_ns, devices, state and layout.
+The recorder adds created_ns, run, part, monotonic_ns, wall_ns, devices, state and layout. Since 0.6
+it adds clock, the state of the wall clock at the beginning of the part: synchronized (null if
+unknown), max_error_s, hardware (the name of the hardware clock, empty without one), steps since the
+start of the gateway, and last_step_ns and last_step_by_ns.
 """
 
 import platform
@@ -63,7 +66,14 @@ _DBC_KEYS = {
     if field.name not in ("enabled", "file", "on_loss")
 }
 """For each key of [dbc], its name in a header."""
-_TYPES = {"program": dict, "devices": list, "escs": list, "ports": list, "state": dict}
+_TYPES = {
+    "program": dict,
+    "devices": list,
+    "escs": list,
+    "ports": list,
+    "state": dict,
+    "clock": dict,
+}
 
 
 @dataclass(frozen=True)

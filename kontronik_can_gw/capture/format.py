@@ -86,7 +86,10 @@ class EntryKind(IntEnum):
     LINE_ERRORS = 15
     """The total number of line errors of an ESC's port (u64)."""
     CLOCK = 16
-    """The wall clock at this time: Unix time in ns (u64)."""
+    """The wall clock at this time: Unix time in ns (u64).
+
+    flags: 1 synchronised, 2 not synchronised, 0 unknown, also in captures before 0.6.
+    """
     LOST = 17
     """Number of entries that could not be recorded here (u64)."""
     NOT_SENT = 18
@@ -107,6 +110,10 @@ class EntryKind(IntEnum):
 
 
 _WITH_ARRIVAL = frozenset({EntryKind.BYTES, EntryKind.FRAME})
+
+
+CLOCK_FLAGS: Mapping[bool | None, int] = {None: 0, True: 1, False: 2}
+"""Flags of a CLOCK entry, for a clock that is synchronised, not synchronised, or unknown."""
 
 
 class Entry(NamedTuple):

@@ -29,6 +29,7 @@ from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.doctor import Finding, Findings, count
 from kontronik_can_gw.desk.doctor.can import check_can
+from kontronik_can_gw.desk.doctor.clock import check_clock
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.desk.doctor.ports import check_port, diagnoses
 from kontronik_can_gw.desk.doctor.service import Unit, check_folder, check_service, unit_of
@@ -126,6 +127,7 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
             found += check_port(machine, esc.name, esc.port, even, reasons.get(esc.name, ""))
         found += check_can(machine, config.can)
     check_service(machine, rest, unit, full)
+    check_clock(machine, rest)
     if _has_low_voltage(machine):
         rest.add("machine.power", "low")
     versions = {"python": platform.python_version(), "kernel": platform.release()}

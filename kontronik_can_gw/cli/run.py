@@ -115,6 +115,7 @@ class _Run:
         from kontronik_can_gw.runtime.native_poller import poller_for
         from kontronik_can_gw.runtime.status.facts import program_facts
         from kontronik_can_gw.runtime.status.statistics import open_statistics
+        from kontronik_can_gw.runtime.system.clock import ClockWatch
 
         path = config_file(self._args.config)
         program = program_facts(path)
@@ -146,6 +147,7 @@ class _Run:
             recorder=recorder,
             poller=poller_for(gateway),
         )
+        loop.follow_clock(ClockWatch())
         # reported before the ports are opened, because a damaged file was already renamed
         for esc, reason in loaded.damaged:
             name = loaded.escs[esc].name

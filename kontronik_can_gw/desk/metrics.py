@@ -128,6 +128,7 @@ def _samples(document: Document, age_s: float) -> Iterator[Sample]:
         yield "can_receive_errors", receive, {}
     for key, count in can["counters"].items():
         yield f"can_{key.removesuffix('_count')}_total", count, {}
+    yield from _clock(document.get("clock") or {})
     for esc in document["escs"]:
         yield from _esc(esc, document["units"])
     for node in document["nodes"]:
@@ -135,6 +136,17 @@ def _samples(document: Document, age_s: float) -> Iterator[Sample]:
             labels = {"esc": node["esc"], "node_id": node["node_id"]}
             yield from _states("canopen_node_state", NmtState, node["state"], labels)
             yield "canopen_pdos_sent_total", node["pdos_sent"], labels
+
+
+def _clock(clock: Document) -> Iterator[Sample]:
+    """Yield the samples of the wall clock. Documents before 0.6 do not have it."""
+    if not clock:
+        return
+    yield "clock_synchronized", clock["synchronized"], {}
+    yield "clock_max_error_seconds", clock["max_error_s"], {}
+    has_hardware = None if clock["hardware"] is None else clock["hardware"] != ""
+    yield "clock_hardware", has_hardware, {}
+    yield "clock_steps_total", clock["steps"], {}
 
 
 def _esc(esc: Document, units: Mapping[str, str]) -> Iterator[Sample]:

@@ -19,6 +19,7 @@ from kontronik_can_gw.runtime.ports.esc_port import EscPort
 from kontronik_can_gw.runtime.status.facts import CanFacts, ProgramFacts, gateway_facts
 from kontronik_can_gw.runtime.status.snapshot import Moment
 from kontronik_can_gw.runtime.status.statistics import Statistics
+from kontronik_can_gw.runtime.system.clock import ClockFacts, ClockWatch, step_in_words
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.runtime.system.process import ProcessFacts, process_facts
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
@@ -76,6 +77,7 @@ class Housekeeping:
         self._statistics = statistics
         self._recorder = recorder
         self._program = program
+        self.clock_watch: ClockWatch | None = None
         self._alive_due = 0 if notifier.watchdog_ns is not None else None
         """Time of the next keep-alive. None if the service manager expects none."""
         self._notify_due = 0
@@ -91,6 +93,7 @@ class Housekeeping:
         self._can.report(now)
         self._log_conflicts(now)
         self._conditions.advance(now)
+        self._follow_clock(now)
         self.follow_recorder(now)
         self.publish(now)
         self._notify(now)
@@ -100,6 +103,30 @@ class Housekeeping:
         if self._alive_due is not None and self._alive_due > now:
             self.due = min(self.due, self._alive_due)
             self.wake_due = min(self.wake_due, self._alive_due)
+
+    def _follow_clock(self, now: int) -> None:
+        """Follow the wall clock, and log that it was set."""
+        if self.clock_watch is None:
+            return
+        by_ns = self.clock_watch.poll(now)
+        if by_ns is not None:
+            text = f"the clock was set {step_in_words(by_ns)}"
+            self._conditions.event("clock", text, now, logging.INFO)
+        self.note_clock()
+
+    def note_clock(self) -> None:
+        """Give the state of the wall clock to the recorder."""
+        if self._recorder is not None:
+            self._recorder.clock_facts = self._clock_facts
+
+    @property
+    def _clock_facts(self) -> ClockFacts:
+        return ClockFacts() if self.clock_watch is None else self.clock_watch.facts
+
+    def close(self) -> None:
+        """Stop following the wall clock."""
+        if self.clock_watch is not None:
+            self.clock_watch.close()
 
     def _collect(self, now: int) -> None:
         """Free the memory that the interpreter keeps for reuse, once a minute."""
@@ -126,6 +153,7 @@ class Housekeeping:
                 store=self._saver.facts(),
                 log_lines=list(self._conditions.recent),
                 recorder=None if self._recorder is None else copy(self._recorder.facts),
+                clock=self._clock_facts,
             )
             statistics.publish(moment)
         self._log(statistics.reports(now), now)

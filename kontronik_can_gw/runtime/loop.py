@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.files.recorder import Recorder
     from kontronik_can_gw.runtime.files.store import ParameterStore
     from kontronik_can_gw.runtime.native_poller import NativePoller
+    from kontronik_can_gw.runtime.system.clock import ClockWatch
 
 _WAKES_PER_TIMEOUT = 4
 """Number of times that the loop wakes at least within the shortest telemetry time-out.
@@ -97,6 +98,10 @@ class Loop:
         if store is not None:
             self._poller.register(store.fileno(), self._saver.take_results)
 
+    def follow_clock(self, watch: "ClockWatch") -> None:
+        """Watch the wall clock. Call it before ``open``. The watch is closed with the loop."""
+        self._housekeeping.clock_watch = watch
+
     def stop(self, reason: str = "stopped") -> None:
         """End ``run`` soon, and log ``reason``. A signal handler or another thread may call it."""
         self._reason = reason
@@ -118,6 +123,7 @@ class Loop:
                 esc.open(now, self._wait, self._others(esc))
             self.can.open(now, self._wait)
             if self._recorder is not None:
+                self._housekeeping.note_clock()  # first, so that the first header has it
                 self._recorder.start(self._wait)
                 self.conditions.log(logging.INFO, f"recording to {self._recorder.words}")
         except UserError:
@@ -246,6 +252,7 @@ class Loop:
             esc.close()
         self.can.close()
         self._poller.close()
+        self._housekeeping.close()
         if self._statistics is not None:
             self._statistics.close()
         if self._recorder is not None:

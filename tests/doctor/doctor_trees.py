@@ -10,6 +10,7 @@ from pathlib import Path
 
 from kontronik_can_gw.desk.doctor import Finding
 from kontronik_can_gw.desk.doctor.machine import Machine
+from kontronik_can_gw.runtime.system.clock import ClockFacts
 
 DIALOUT = 20
 ROOM = (False, 1 << 30)
@@ -24,6 +25,7 @@ class Tree(Machine):
         self.programs: dict[tuple[str, ...], str] = {}
         self.devices: dict[str, os.stat_result] = {}
         self.full: dict[str, tuple[bool, int]] = {}
+        self.wall_clock = ClockFacts(synchronized=True, hardware="rtc-ds3231")
         self.closed: set[str] = set()
         """Files and folders that this user may not open or write to."""
         root.chmod(0o755)  # only the owner may enter the folder that pytest creates
@@ -131,6 +133,9 @@ class Tree(Machine):
 
     def status(self, name: str) -> os.stat_result | None:
         return self.devices.get(self.real(name)) or super().status(name)
+
+    def clock(self) -> ClockFacts:
+        return self.wall_clock
 
     def run(self, *command: str) -> str:
         """Return the output stored for the longest beginning of this command, or ""."""

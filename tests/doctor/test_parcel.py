@@ -21,7 +21,7 @@ from command_line import Done, refused, run, written
 from doctor_trees import Tree
 
 from kontronik_can_gw.assembly.assemble import load_configuration
-from kontronik_can_gw.capture.format import SUFFIX, Block, Kind, Scanner, block, read_json
+from kontronik_can_gw.capture.format import SUFFIX, Block, EntryKind, Scanner, block, read_json
 from kontronik_can_gw.cli.parcel import capture_folders
 from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.keys import shipped
@@ -411,7 +411,7 @@ def test_a_copy_without_the_dbc_keeps_telemetry(tmp_path: Path) -> None:
     copy = b"".join(clean_capture([original], "c", Cleaner(), with_dbc=False))
     with open_input(written(tmp_path / f"x{SUFFIX}", copy)) as found:
         data = b"".join(found.esc_bytes(0))
-    expected = [entry.data for entry in bench.entries if entry.kind == Kind.BYTES]
+    expected = [entry.data for entry in bench.entries if entry.kind == EntryKind.BYTES]
     assert data == b"".join(expected)
     assert b"EscStatus" not in b"".join(found.payload for found in blocks(copy))
 

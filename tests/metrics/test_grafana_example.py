@@ -22,6 +22,8 @@ from harness import LoggedProcess
 from statistics_bench import Bench
 from vcan_tools import GatewayProcess, wait_for
 
+from kontronik_can_gw.runtime.system.clock import ClockFacts
+
 FOLDER = Path(__file__).parents[2] / "examples/grafana"
 RULES = [
     rule
@@ -67,7 +69,7 @@ def prometheus(tmp_path: Path) -> Iterator[Prometheus]:
         pytest.skip("there is no Prometheus: sudo apt-get install prometheus")
     bench = Bench(2)
     bench.run(3)
-    document = bench.document()
+    document = bench.document(clock=ClockFacts(True, 0.01, "rtc-ds3231"))
     file = tmp_path / "status.json"
     stop = threading.Event()
 

@@ -115,6 +115,7 @@ def trial(facts: Facts) -> None:
     facts["fresh"] = fresh()
     until(lambda: "telemetry ok" in shown()["StatusText"])  # reported once a second
     facts["running"] = shown()
+    facts["clock"] = clock_states()
     pid = facts["running"]["MainPID"]
     facts["process"] = Path(f"/proc/{pid}/status").read_text()
     facts["nice"] = os.getpriority(os.PRIO_PROCESS, int(pid))
@@ -171,6 +172,34 @@ def trial(facts: Facts) -> None:
     facts["end"] = service("uninstall")
 
 
+def clock_states() -> list[Any]:
+    """Return the clock's state in the status: at first, after synchronising it, after a step."""
+    file = Path("/run/kontronik-can-gw/status.json")
+
+    def state() -> Any:
+        return json.loads(file.read_text())["clock"]
+
+    found = [state()]
+    synchronise()
+    until(lambda: state()["synchronized"])
+    found.append(state())
+    time.clock_settime(time.CLOCK_REALTIME, time.time() + 3600)
+    until(lambda: state()["steps"])
+    found.append(state())
+    return found
+
+
+def synchronise() -> None:
+    """Tell the kernel that the clock is synchronised, as a time service does."""
+    import ctypes
+
+    numbers = (ctypes.c_long * 64)()
+    numbers[0] = 0x0004 | 0x0010  # ADJ_MAXERROR, ADJ_STATUS
+    numbers[3] = 1000  # maxerror in µs; the status, with STA_UNSYNC, is 0
+    if ctypes.CDLL(None, use_errno=True).adjtimex(numbers) < 0:
+        raise OSError(ctypes.get_errno(), "adjtimex")
+
+
 def left_over() -> list[str]:
     found = [*Path("/etc").rglob("*kontronik*"), *Path("/var/lib").glob("kontronik*")]
     return sorted(str(path) for path in found)
@@ -216,6 +245,9 @@ def probe() -> None:
         "namespace": unshared,
         "priority": lambda: os.setpriority(os.PRIO_PROCESS, 0, 5),
         "another user": lambda: os.setuid(0),
+        "clock state": clock_error,
+        "set clock": lambda: time.clock_settime(time.CLOCK_REALTIME, time.time()),
+        "adjust clock": synchronise,
     }
     found = {}
     for name, attempt in tries.items():
@@ -225,6 +257,14 @@ def probe() -> None:
         except Exception as error:
             found[name] = f"{type(error).__name__}: {error}"
     print(json.dumps(found))
+
+
+def clock_error() -> None:
+    """Read the largest error of the clock. OSError if the sandbox forbids it."""
+    from kontronik_can_gw.runtime.system.clock import max_error_us
+
+    if max_error_us() is None:
+        raise OSError("adjtimex is refused")
 
 
 def unshared() -> None:

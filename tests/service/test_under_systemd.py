@@ -155,10 +155,11 @@ def test_a_killed_or_frozen_process_is_replaced_and_logs_its_stack(facts: Facts)
 
 def test_the_sandbox_allows_only_the_needed_actions(facts: Facts) -> None:
     needed = {"CAN socket", "netlink", "abstract socket", "state folder", "runtime folder"}
-    needed |= {"lock folder", "terminal", "ctypes", "other processes", "machine-id"}
+    needed |= {"lock folder", "terminal", "ctypes", "other processes", "machine-id", "clock state"}
     refused = dict.fromkeys(("internet", "packet"), "Errno 97")
     refused |= dict.fromkeys(("write /etc", "set kernel"), "Errno 30")
-    denied = ("write and execute", "another device", "namespace", "priority", "another user")
+    denied = ["write and execute", "another device", "namespace", "priority", "another user"]
+    denied += ["set clock", "adjust clock"]
     refused |= dict.fromkeys(denied, "Errno 1]")
     probe = facts["probe"]
     assert set(probe) == {*needed, *refused}
@@ -169,6 +170,18 @@ def test_the_sandbox_allows_only_the_needed_actions(facts: Facts) -> None:
 @pytest.mark.skipif(not shared_object().exists(), reason="the core in C was not built")
 def test_the_c_core_can_be_loaded_in_the_sandbox(facts: Facts) -> None:
     assert "core: C" in [message for _, message in facts["log"]]
+
+
+def test_the_state_of_the_clock_is_known_in_the_sandbox(facts: Facts) -> None:
+    before, synchronised, stepped = facts["clock"]
+    assert (before["synchronized"], before["max_error_s"], before["steps"]) == (False, None, 0)
+    assert before["hardware"] == ""
+    assert synchronised["synchronized"] is True
+    assert 0 < synchronised["max_error_s"] < 1
+    assert stepped["steps"] == 1
+    assert 3599 < stepped["last_step_s"] < 3601
+    messages = [str(message) for _, message in facts["log"]]
+    assert any(message.startswith("the clock was set by +3600.") for message in messages)
 
 
 def test_metrics_are_served_and_the_gateway_still_cannot_use_ip(facts: Facts) -> None:

@@ -14,6 +14,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
+from kontronik_can_gw.runtime.system.clock import (
+    MAX_ERROR_US,
+    ClockFacts,
+    hardware_clock,
+    max_error_us,
+)
+
 _PATIENCE_S = 5.0
 """Longest time that a program may take."""
 
@@ -97,6 +104,14 @@ class Machine:
         Access lists are respected.
         """
         return os.access(self.path(name), mode)
+
+    def clock(self) -> ClockFacts:
+        """Return the state of the wall clock."""
+        error = max_error_us()
+        return ClockFacts(
+            synchronized=None if error is None else error < MAX_ERROR_US,
+            hardware=hardware_clock(self.path("/sys/class/rtc")),
+        )
 
     def run(self, *command: str) -> str:
         """Return the output of a program, regardless of its exit code.

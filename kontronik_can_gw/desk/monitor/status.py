@@ -31,6 +31,7 @@ from kontronik_can_gw.native.load import in_words
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.runtime.status.snapshot import FORMAT, PROGRAM, STALE_NS
 from kontronik_can_gw.runtime.system import folders
+from kontronik_can_gw.runtime.system.clock import ClockFacts, step_in_words
 from kontronik_can_gw.runtime.system.fault_log import duration
 from kontronik_can_gw.times import MS, SECOND
 
@@ -42,6 +43,7 @@ FOREIGN = f"is not a statistics file of {PROGRAM}. Check statistics.file."
 MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """Exceptions caused by a document whose values have unexpected types."""
 _WIDTH = 80
+_CLOCK_STYLES: Mapping[bool | None, str] = {True: "dim", None: "dim", False: "yellow"}
 _WIDTHS = {
     "ESC": 3,
     "link": 10,
@@ -277,6 +279,19 @@ def _head(seen: Seen, document: Document) -> Iterator[Text]:
         layout = f", layout {gateway['layout']}" if gateway.get("layout") else ""
         core = in_words(gateway["core"], gateway["core_reason"])
         yield line((f"{core}{layout}", "dim"))
+    clock = document.get("clock")
+    if clock:  # documents of 0.5.0 do not have it
+        yield from wrapped(f"clock: {_clock(clock)}", _CLOCK_STYLES[clock["synchronized"]], _WIDTH)
+
+
+def _clock(clock: Document) -> str:
+    """Describe the state of the wall clock and its last step."""
+    facts = ClockFacts(synchronized=clock["synchronized"], hardware=clock["hardware"])
+    text = printable(facts.in_words)
+    if clock["last_step"] is not None:
+        step = step_in_words(round(clock["last_step_s"] * SECOND))
+        text += f", set {step} at {printable(clock['last_step'])}"
+    return text
 
 
 def _can_lines(document: Document) -> Iterator[Text]:

@@ -25,9 +25,11 @@ from kontronik_can_gw.capture.format import (
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.header_parts import HeaderError
+from kontronik_can_gw.desk.recordings.capture_clock import clock_facts, clock_steps
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, timed
+from kontronik_can_gw.desk.recordings.trusted_times import TrustedTimes
 from kontronik_can_gw.errors import RunError, UserError
 
 if TYPE_CHECKING:
@@ -46,8 +48,6 @@ _LOOK_FOR_HEADER = 1 << 25
 """Number of bytes of a part in which the header is looked for."""
 _MAX_DAMAGE = 50
 """Number of damaged places that are listed."""
-_STEP_NS = 100_000_000
-"""A smaller change of the wall clock is a correction and not reported."""
 
 
 class CaptureInput(PlayedInput):
@@ -84,6 +84,7 @@ class CaptureInput(PlayedInput):
         self.created_ns = int(created_ns or 0)
         self._begun = _clock_of(self.header) or (0, 0)
         """Time of the recording at its start, and the offset of the wall clock then."""
+        self.trust = TrustedTimes(clock_facts(self.header).synchronized)
         self._last_ns = 0
         """Time of the previous entry."""
         self._impossible = 0
@@ -101,13 +102,7 @@ class CaptureInput(PlayedInput):
 
     @property
     def clock_steps(self) -> Sequence[ClockStep]:
-        steps = []
-        offset = self._begun[1]
-        for time_ns, after in self._offsets:
-            if abs(after - offset) > _STEP_NS:
-                steps.append(ClockStep(time_ns, after - offset))
-            offset = after
-        return steps
+        return clock_steps(self._begun[1], self._offsets)
 
     @property
     def channel(self) -> str:
@@ -219,6 +214,7 @@ class CaptureInput(PlayedInput):
         if is_clock:
             # entries of the same time were written before the clock was set
             self._offsets.append((time_ns + 1, wall_ns - time_ns))
+            self.trust.add_flags(time_ns + 1, entry.flags)
         if time_ns < self._last_ns:
             return entry._replace(time_ns=self._last_ns)
         self._last_ns = time_ns
@@ -244,6 +240,8 @@ class CaptureInput(PlayedInput):
             "configuration": setup.file,
             "DBC": dbc,
         }
+        if isinstance(header.get("clock"), dict):
+            self.provenance["clock at the start"] = clock_facts(header).in_words
         for index, (esc, port) in enumerate(zip(setup.escs, setup.ports, strict=False)):
             known = "unknown device"
             if index < len(self._devices) and isinstance(self._devices[index], dict):
@@ -289,6 +287,7 @@ class CaptureInput(PlayedInput):
         self._impossible = 0
         self.damage = list(self._headerless)
         self._offsets = []
+        self.trust.restart()
         for number, path in enumerate(self._paths):
             expected = 0
             is_closed = False
@@ -340,6 +339,7 @@ class CaptureInput(PlayedInput):
         clock = _clock_of(header)
         if clock is not None:
             self._offsets.append(clock)
+            self.trust.add(clock[0], clock_facts(header).synchronized)
         number = header.get("part", part)
         first = self.header.get("part", 0)
         if type(number) is not int:

@@ -129,7 +129,8 @@ def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> st
     recording.begin_ns = origin_ns
     fields = [recording.fields[index] for index in choice.columns]
     has_utc = recording.wall_ns(origin_ns) is not None
-    table = Table(fields, has_utc, origin_ns, recording.provenance)
+    has_trust = has_utc and recording.trust.is_known
+    table = Table(fields, has_utc, has_trust, origin_ns, recording.provenance)
     file = out.open()
     _flush_before_waits(recording, file)
     writer = _table_writer(file, form, table)

@@ -18,7 +18,9 @@ from kontronik_can_gw.status import GatewayStatus
 
 TIME = "Time"
 UTC = "Utc"
-_OWN = (TIME, UTC)
+TRUSTED = "UtcTrusted"
+"""1 while the wall clock was synchronised, else 0. Missing if the recording has no state of it."""
+_OWN = (TIME, UTC, TRUSTED)
 Read = Callable[[Any, GatewayStatus, int], Value]
 """A function that returns a value at a time, or None if the value is not fresh.
 
@@ -97,6 +99,8 @@ class Table:
     fields: Sequence[Field]
     has_utc: bool
     """True if the rows have Unix times."""
+    has_trust: bool = False
+    """True if the rows have the column TRUSTED."""
     origin_ns: int = 0
     """The recording's time at the table's time 0."""
     provenance: Mapping[str, str] = field(default_factory=dict)

@@ -128,8 +128,9 @@ class PlayedInput(Input):
         for since_ns, _ in self._offsets:
             edges.add(max(begin, bisect_left(rows.times, since_ns)))
         for first, end in pairwise(sorted(edges)):
-            offset_ns = self.wall_offset_ns(rows.times[first])
-            yield PlayedBlock(rows, first, end, offset_ns)
+            time_ns = rows.times[first]
+            is_trusted = self.trust.at(time_ns)
+            yield PlayedBlock(rows, first, end, self.wall_offset_ns(time_ns), is_trusted)
 
     def _silent_gateway(self, readers: Sequence[OutputMaker]) -> Gateway:
         """Return a gateway without messages, whose outputs include ``readers``.

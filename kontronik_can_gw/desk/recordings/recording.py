@@ -14,6 +14,7 @@ from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.fields import Field, fields_of_values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.stream import Stream
+from kontronik_can_gw.desk.recordings.trusted_times import TrustedTimes
 from kontronik_can_gw.desk.words import duration
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
@@ -83,7 +84,8 @@ class Block:
     """Rows, stored as columns.
 
     ``times`` are ns of the recording's clock and do not decrease. A time plus ``wall_ns`` is Unix
-    time. ``wall_ns`` is None if the time of day is unknown.
+    time. ``wall_ns`` is None if the time of day is unknown. ``is_trusted`` is true while
+    the clock was synchronised, and None if that is unknown.
     """
 
     def __init__(
@@ -91,9 +93,11 @@ class Block:
         times: Sequence[int],
         columns: Sequence[Sequence[Any]],
         wall_ns: int | None,
+        is_trusted: bool | None = None,
     ) -> None:
         self.times = times
         self.wall_ns = wall_ns
+        self.is_trusted = is_trusted
         self._columns = columns
 
     def __len__(self) -> int:
@@ -109,7 +113,7 @@ class Block:
         if (begin, end) == (0, len(self)):
             return self
         columns = [column[begin:end] for column in self._columns]
-        return Block(self.times[begin:end], columns, self.wall_ns)
+        return Block(self.times[begin:end], columns, self.wall_ns, self.is_trusted)
 
     def between(self, low_ns: int, high_ns: int) -> Self:
         """Return the rows from one time to another, both included."""
@@ -125,8 +129,15 @@ class Block:
 class PlayedBlock(Block):
     """Rows ``begin`` to ``end`` of the ``Rows`` that the C core made."""
 
-    def __init__(self, rows: "Rows", begin: int, end: int, wall_ns: int | None) -> None:
-        super().__init__(rows.times[begin:end], (), wall_ns)
+    def __init__(
+        self,
+        rows: "Rows",
+        begin: int,
+        end: int,
+        wall_ns: int | None,
+        is_trusted: bool | None = None,
+    ) -> None:
+        super().__init__(rows.times[begin:end], (), wall_ns, is_trusted)
         self.made = rows
         self.begin = begin
         self.end = end
@@ -142,7 +153,8 @@ class PlayedBlock(Block):
         return found
 
     def part(self, begin: int, end: int) -> "PlayedBlock":
-        return PlayedBlock(self.made, self.begin + begin, self.begin + end, self.wall_ns)
+        first = self.begin
+        return PlayedBlock(self.made, first + begin, first + end, self.wall_ns, self.is_trusted)
 
 
 class Input(ABC):
@@ -172,6 +184,8 @@ class Input(ABC):
         """The error for a file that proved to be no recording. Set after its end was read."""
         self.begin_ns = 0
         """Time 0 of the output, from which ``clock_notes`` count. Set by the conversion."""
+        self.trust = TrustedTimes()
+        """When the wall clock was synchronised. Complete after the end was read."""
         self.resources = ExitStack()
         """Resources that are closed with the recording."""
 
@@ -182,8 +196,15 @@ class Input(ABC):
 
     @property
     def clock_notes(self) -> list[str]:
-        """One line for each kind of clock step, with times and sizes. Empty without steps."""
-        return _described(self.clock_steps, self.begin_ns)
+        """A line for each kind of clock step, and one for times without synchronisation.
+
+        Empty if the clock is not known to be wrong.
+        """
+        notes = _described(self.clock_steps, self.begin_ns)
+        untrusted = list(self.trust.untrusted())
+        if untrusted:
+            notes.append(_described_trust(untrusted, self.begin_ns))
+        return notes
 
     @property
     def without_data(self) -> Mapping[str, int]:
@@ -243,13 +264,16 @@ class Input(ABC):
             chosen = range(len(self.fields))
         samples = self.samples_in_python(chosen)
         # the offset is taken with each row, so that a later clock step does not move earlier rows
-        rows = ((self.wall_offset_ns(row.time_ns), *row) for row in samples)
+        rows = ((self._clock_at(row.time_ns), *row) for row in samples)
         size = ROWS if self.stream is None else 1
         while some := list(islice(rows, size)):
-            for wall_ns, group in groupby(some, itemgetter(0)):
+            for (wall_ns, is_trusted), group in groupby(some, itemgetter(0)):
                 _, times, values = zip(*group, strict=True)
                 columns = [*zip(*values, strict=True)]
-                yield Block(times, columns, wall_ns)
+                yield Block(times, columns, wall_ns, is_trusted)
+
+    def _clock_at(self, time_ns: int) -> tuple[int | None, bool | None]:
+        return self.wall_offset_ns(time_ns), self.trust.at(time_ns)
 
     def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
         """Yield the rows one by one."""
@@ -314,6 +338,21 @@ def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:
             f"times jump ahead {_some_of(listed)}: a pause, or the clock was set; the jump is kept"
         )
     return notes
+
+
+def _described_trust(untrusted: Sequence[tuple[int, int | None]], begin_ns: int) -> str:
+    """Describe the times in which the wall clock was not synchronised."""
+    listed = []
+    for since_ns, until_ns in untrusted:
+        parts = []
+        if since_ns > begin_ns:
+            parts.append(f"from {duration(since_ns - begin_ns)}")
+        if until_ns is not None:
+            parts.append(f"until {duration(max(0, until_ns - begin_ns))}")
+        listed.append(" ".join(parts))
+    some = _some_of([text for text in listed if text])
+    when = f" {some}" if some else ""
+    return f"the clock was not synchronised{when}: dates and times of day are not reliable then"
 
 
 def _by_and_after(step: ClockStep, elapsed_ns: int) -> str:

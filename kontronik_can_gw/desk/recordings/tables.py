@@ -14,7 +14,7 @@ from itertools import repeat
 from typing import IO, TYPE_CHECKING, Any
 
 from kontronik_can_gw.desk.libraries import missing_library
-from kontronik_can_gw.desk.recordings.fields import TIME, UTC, ColumnType, Field, Table
+from kontronik_can_gw.desk.recordings.fields import TIME, TRUSTED, UTC, ColumnType, Field, Table
 from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock
 from kontronik_can_gw.native import load
 from kontronik_can_gw.times import SECOND
@@ -102,6 +102,9 @@ class TextTable:
         """Text before the Unix time."""
         self._utc_end = ""
         """Text after the Unix time."""
+        self._trusted = ","
+        """Text before the cell of TRUSTED."""
+        self._makers: dict[bool | None, Lines] = {}
         self._end = "\n"
         self._nothing = ""
         """Cell of a value that is not available."""
@@ -111,6 +114,7 @@ class TextTable:
             self._start = f'{{"{TIME}": '
             self._utc = f', "{UTC}": "'
             self._utc_end = '"'
+            self._trusted = f', "{TRUSTED}": '
             self._end = "}\n"
             self._nothing = "null"
             self._prefixes = [f", {json.dumps(one.name)}: " for one in table.fields]
@@ -118,6 +122,8 @@ class TextTable:
         heads = [f"{TIME} [s]"]
         if table.has_utc:
             heads.append(UTC)
+        if table.has_trust:
+            heads.append(TRUSTED)
         heads += [one.header for one in table.fields]
         line = ",".join(map(csv_text, heads)) + "\n"
         file.write(line.encode())
@@ -130,7 +136,8 @@ class TextTable:
             return
         begin = block.begin
         origin_ns = self._table.origin_ns
-        for piece in self._lines.of(block.made, begin, block.end, origin_ns, wall_ns):
+        lines = self._lines(block.is_trusted)
+        for piece in lines.of(block.made, begin, block.end, origin_ns, wall_ns):
             if isinstance(piece, int):  # the number of a row that C cannot write
                 row = piece - begin
                 self._write(block.part(row, row + 1))
@@ -139,17 +146,25 @@ class TextTable:
 
     def _write(self, block: Block) -> None:
         wall_ns = block.wall_ns or 0
-        heads = map(self._head_of_line, block.times, repeat(wall_ns))
+        after_utc = self._after_utc(block.is_trusted)
+        heads = map(self._head_of_line, block.times, repeat(wall_ns), repeat(after_utc))
         cells = []
         for texts, column in zip(self._texts, block.columns, strict=True):
             cells.append(map(texts.__getitem__, column))
         lines = map("".join, zip(heads, *cells, repeat(self._end)))
         self._file.write("".join(lines).encode())
 
-    def _head_of_line(self, time_ns: int, wall_ns: int) -> str:
+    def _after_utc(self, is_trusted: bool | None) -> str:
+        """Return the text after the Unix time, with the cell of TRUSTED."""
+        if not self._table.has_trust:
+            return self._utc_end
+        cell = self._nothing if is_trusted is None else str(int(is_trusted))
+        return f"{self._utc_end}{self._trusted}{cell}"
+
+    def _head_of_line(self, time_ns: int, wall_ns: int, after_utc: str) -> str:
         text = self._start + seconds_text(time_ns - self._table.origin_ns)
         if self._table.has_utc:
-            text += self._utc + utc_text(time_ns + wall_ns) + self._utc_end
+            text += self._utc + utc_text(time_ns + wall_ns) + after_utc
         return text
 
     @cached_property
@@ -165,9 +180,13 @@ class TextTable:
             return self._nothing
         return str(value)
 
-    @cached_property
-    def _lines(self) -> "Lines":
-        """Makes the same lines in C."""
+    def _lines(self, is_trusted: bool | None) -> "Lines":
+        """Return the maker of the same lines in C."""
+        if is_trusted not in self._makers:
+            self._makers[is_trusted] = self._make_lines(is_trusted)
+        return self._makers[is_trusted]
+
+    def _make_lines(self, is_trusted: bool | None) -> "Lines":
         from kontronik_can_gw.native.offline import Lines, Style
 
         utc = None
@@ -176,7 +195,7 @@ class TextTable:
         style = Style(
             self._start.encode(),
             utc,
-            self._utc_end.encode(),
+            self._after_utc(is_trusted).encode(),
             self._end.encode(),
             self._nothing.encode(),
         )
@@ -222,6 +241,8 @@ class ParquetTable:
         heads = [pa.field(f"{TIME} [s]", pa.float64(), metadata={"unit": "s"})]
         if table.has_utc:
             heads.append(pa.field(UTC, pa.timestamp("ns", tz="UTC")))
+        if table.has_trust:
+            heads.append(pa.field(TRUSTED, pa.int8()))
         for one in table.fields:
             about = {
                 "signal": one.name,
@@ -261,6 +282,9 @@ class ParquetTable:
         if self._table.has_utc:
             wall = compute.add(times, wall_ns)
             arrays.append(wall.cast(pa.timestamp("ns", tz="UTC")))
+        if self._table.has_trust:
+            cell = None if block.is_trusted is None else int(block.is_trusted)
+            arrays.append(pa.array([cell] * len(block), pa.int8()))
         for index, one in enumerate(self._table.fields):
             if isinstance(block, PlayedBlock):
                 array = self._played(block, index, one)

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.capture.format import (
+    CLOCK_FLAGS,
     SUFFIX,
     EntryKind,
     block,
@@ -35,6 +36,7 @@ from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.files.disk import is_locked, reason_of, sync_folder, write_all
+from kontronik_can_gw.runtime.system.clock import ClockFacts
 from kontronik_can_gw.runtime.system.worker import Report, Worker
 from kontronik_can_gw.times import MS, SECOND
 
@@ -107,6 +109,9 @@ class Recorder:
         """Time of the next check of the folder."""
         self._clock_ns = 0
         """Time of the last comparison of the clocks."""
+        self.clock_facts = ClockFacts()
+        """The state of the wall clock. Only the loop's thread sets it."""
+        self._recorded_clock = ClockFacts()
         self._offset = 0
         """The wall clock's time minus the monotonic clock's, in ns, as last recorded."""
         self._devices: list[Any] = []
@@ -254,12 +259,17 @@ class Recorder:
         if lost > 0:
             self._recorded_losses += lost
             items.append((last, EntryKind.LOST, 0, numbers_data(lost), 0, None))
-        if now - self._clock_ns >= _CLOCK_NS:
+        clock = self.clock_facts
+        recorded = self._recorded_clock
+        is_changed = (clock.synchronized, clock.steps) != (recorded.synchronized, recorded.steps)
+        if is_changed or now - self._clock_ns >= _CLOCK_NS:
             self._clock_ns = now
+            self._recorded_clock = clock
             offset = time.time_ns() - self._clock()
-            if abs(offset - self._offset) > _STEP_NS:
+            if is_changed or abs(offset - self._offset) > _STEP_NS:
                 self._offset = offset
-                items.append((last, EntryKind.CLOCK, 0, numbers_data(last + offset), 0, None))
+                flags = CLOCK_FLAGS[clock.synchronized]
+                items.append((last, EntryKind.CLOCK, 0, numbers_data(last + offset), flags, None))
 
     def _fail(self, error: Exception, now: int) -> None:
         file = self._file
@@ -288,12 +298,22 @@ class Recorder:
         part = self._part
         self._part += 1  # also after a failure, so that no name is tried twice
         self._recorded_devices = self._devices
+        clock = self.clock_facts
+        self._recorded_clock = clock
         header = dict(self.header) | {
             "run": self._run,
             "part": part,
             "monotonic_ns": since,
             "wall_ns": wall,
             "devices": self._recorded_devices,
+            "clock": {
+                "synchronized": clock.synchronized,
+                "max_error_s": clock.max_error_s,
+                "hardware": clock.hardware,
+                "steps": clock.steps,
+                "last_step_ns": clock.last_step_ns,
+                "last_step_by_ns": clock.last_step_by_ns,
+            },
         }
         name = f"{self._stamp}-{self._run[:6]}-{part:05d}{SUFFIX}"
         return CapturePart(self._folder / name, json_payload(header), now)

@@ -32,6 +32,7 @@ from kontronik_can_gw.runtime.status.facts import (
     StoreFacts,
     utc,
 )
+from kontronik_can_gw.runtime.system.clock import ClockFacts
 from kontronik_can_gw.runtime.system.process import ProcessFacts
 from kontronik_can_gw.status import UNCONFIGURED, GatewayStatus, name_in_words
 from kontronik_can_gw.times import SECOND
@@ -68,6 +69,7 @@ class Moment(NamedTuple):
     store: StoreFacts | None = None
     log_lines: Sequence[str] = ()
     recorder: "RecorderFacts | None" = None
+    clock: ClockFacts = ClockFacts()
 
 
 def snapshot(moment: Moment, before: Moment | None = None) -> str:
@@ -114,6 +116,7 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
         "outputs": gateway.outputs,
         "store": _store(moment.store),
         "recording": None if moment.recorder is None else vars(moment.recorder),
+        "clock": _clock(moment.clock),
         "log": moment.log_lines[-LOG_LINES:],
         "rates": _rates(moment, before),
     }
@@ -126,6 +129,19 @@ def _store(store: StoreFacts | None) -> Document | None:
     return {
         "waiting": store.waiting,
         "last_error": store.last_error or None,
+    }
+
+
+def _clock(clock: ClockFacts) -> Document:
+    """Return the state of the wall clock. null means unknown."""
+    step_ns = clock.last_step_ns
+    return {
+        "synchronized": clock.synchronized,
+        "max_error_s": clock.max_error_s,
+        "hardware": clock.hardware,
+        "steps": clock.steps,
+        "last_step": None if step_ns is None else utc(step_ns / SECOND),
+        "last_step_s": None if step_ns is None else _seconds(clock.last_step_by_ns),
     }
 
 
