@@ -5,8 +5,12 @@
 The packages need neither a network nor a compiler. The gateway and the core are taken from the
 wheel of `make wheels`, which has an object for each machine. pip downloads the libraries in
 vendored.txt and checks their hashes. The files of the service are the ones that `service install`
-writes. All files in a package have the time SOURCE_DATE_EPOCH, or the time of the last commit if it
-is not set, so the same sources give the same bytes.
+writes. Beside each package is its software bill of materials (sbom.py), which is also in the
+package.
+
+The same sources give the same bytes, whatever the folder, the time, the time zone, the language and
+the umask of the build are. All files in a package have the time SOURCE_DATE_EPOCH, or the time of
+the last commit if it is not set.
 """
 
 import gzip
@@ -22,6 +26,8 @@ import zipfile
 from collections.abc import Sequence
 from email.utils import formatdate
 from pathlib import Path
+
+from sbom import bill_of_materials
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.cli.service import PLAIN, planned
@@ -46,6 +52,18 @@ COMPLETIONS = {
     "fish": f"fish/vendor_completions.d/{NAME}.fish",
 }
 _PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
+_SAME_EVERYWHERE = {
+    "LC_ALL": "C.UTF-8",
+    "LANGUAGE": "",
+    "TZ": "UTC",
+    "COLUMNS": "80",
+    "PYTHONHASHSEED": "0",
+    "DPKG_DEB_THREADS_MAX": "1",
+}
+"""Environment of all programs, so that their output does not depend on the machine.
+
+xz with several threads divides the data differently.
+"""
 _FOR_ANY = ("--python-version", "3.11", "--platform", "manylinux2014_x86_64")
 
 
@@ -85,9 +103,14 @@ def unpack(wheel: Path, folder: Path, keep: str = "") -> None:
                 file.extract(name, folder)
 
 
+def environment_at(seconds: int) -> dict[str, str]:
+    """Return the environment of a program whose output has this time."""
+    return os.environ | _SAME_EVERYWHERE | {"SOURCE_DATE_EPOCH": str(seconds)}
+
+
 def output_of(*command: str) -> str:
     """Return the output of a program that uses these sources."""
-    environment = os.environ | {"PYTHONPATH": str(PROJECT), "COLUMNS": "80"}
+    environment = environment_at(source_time()) | {"PYTHONPATH": str(PROJECT)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         sys.exit(f"make_deb.py: {' '.join(command)}: {done.stderr}")
@@ -184,18 +207,30 @@ def put_control(tree: Path, architecture: str) -> None:
         put(control / name, (HERE / name).read_bytes(), 0o755)
 
 
-def build(tree: Path, wheel: Path, architecture: str, seconds: int, folder: Path) -> Path:
+def build(
+    tree: Path,
+    wheel: Path,
+    libraries: Sequence[Path],
+    architecture: str,
+    seconds: int,
+    folder: Path,
+) -> Path:
     """Build the package of one architecture. This changes ``tree``, a result of ``make_tree``."""
-    unpack(wheel, tree / "usr/lib" / NAME, shared_object(MACHINES[architecture]).name)
+    core = shared_object(MACHINES[architecture]).name
+    modules = tree / "usr/lib" / NAME
+    unpack(wheel, modules, core)
+    about = {"name": NAME, "version": version(), "architecture": architecture}
+    content = (modules / "kontronik_can_gw/native" / core).read_bytes()
+    bill = bill_of_materials(about, (core, content), libraries, seconds)
+    put(tree / f"usr/share/doc/{NAME}/{NAME}.cdx.json", bill)
     put_control(tree, architecture)
     for path in [tree, *tree.rglob("*")]:
         path.chmod(0o755 if path.is_dir() or path.stat().st_mode & 0o100 else 0o644)
         os.utime(path, (seconds, seconds))
     package = folder / f"{NAME}_{version()}_{architecture}.deb"
-    folder.mkdir(parents=True, exist_ok=True)
+    put(package.with_suffix(".cdx.json"), bill)
     command = ["dpkg-deb", "--root-owner-group", "-Zxz", "--build", str(tree), str(package)]
-    environment = os.environ | {"SOURCE_DATE_EPOCH": str(seconds)}
-    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(command, env=environment_at(seconds), check=True, stdout=subprocess.DEVNULL)
     return package
 
 
@@ -208,13 +243,14 @@ def make(wheel: Path, libraries: Sequence[Path], folder: Path) -> list[Path]:
         for architecture in MACHINES:
             tree = Path(scratch, architecture)
             shutil.copytree(common, tree)
-            made.append(build(tree, wheel, architecture, seconds, folder))
+            made.append(build(tree, wheel, libraries, architecture, seconds, folder))
     return made
 
 
 def core_wheel(folder: Path) -> Path:
     """Build and return the wheel of `make wheels`, which checks and runs all its objects."""
-    subprocess.run([sys.executable, PROJECT / "tests/native/wheels.py", folder], check=True)
+    command = [sys.executable, str(PROJECT / "tests/native/wheels.py"), str(folder)]
+    subprocess.run(command, env=environment_at(source_time()), check=True)
     (wheel,) = folder.iterdir()
     return wheel
 

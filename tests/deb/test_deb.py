@@ -6,8 +6,10 @@ gateway from them (in_fresh_roots.py).
 """
 
 import gzip
+import hashlib
 import importlib.metadata
 import io
+import json
 import os
 import re
 import shlex
@@ -17,12 +19,15 @@ import sys
 import tarfile
 import tomllib
 import zipfile
+from email import message_from_string
 from pathlib import Path
+from typing import Any
 
 import make_deb
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from sbom import licence_of
 
 from kontronik_can_gw.cli.service import PLAIN, planned
 
@@ -35,6 +40,15 @@ PINS = [
     if not line.startswith("#")
 ]
 VENDORED = {canonicalize_name(pin.name): pin for pin in PINS}
+CANTOOLS = """Metadata-Version: 2.1
+Name: cantools
+Version: 45.1.0
+Summary: CAN BUS tools.
+License: MIT
+Requires-Dist: bitstruct>=8.16.1
+Requires-Dist: python-can>=3.3.4
+Requires-Dist: matplotlib; extra == 'plot'
+"""
 OWN = f"./usr/lib/{make_deb.NAME}/kontronik_can_gw/"
 
 if shutil.which("dpkg-deb") is None:
@@ -48,10 +62,8 @@ def zipped(path: Path, files: dict[str, bytes]) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """Build the packages. Return their contents by architecture."""
-    folder = tmp_path_factory.mktemp("deb")
+def inputs(folder: Path) -> tuple[Path, list[Path]]:
+    """Make replacements for the wheels of the gateway and of the libraries."""
     files = {}
     for path in (PROJECT / "kontronik_can_gw").rglob("*"):
         if path.is_file() and path.suffix in (".py", ".toml", ".service"):
@@ -60,7 +72,18 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
         files[f"kontronik_can_gw/native/core-{machine}.so"] = machine.encode()
     wheel = zipped(folder / "gateway.whl", files)
     library = {"bitstruct/__init__.py": b"", "bitstruct/c.so": b"", "bitstruct.data/scripts/x": b""}
-    libraries = [zipped(folder / "bitstruct.whl", library)]
+    user = {"cantools/__init__.py": b"", "cantools-45.1.0.dist-info/METADATA": CANTOOLS.encode()}
+    return wheel, [
+        zipped(folder / "bitstruct-8.24.0-cp311-cp311-linux_x86_64.whl", library),
+        zipped(folder / "cantools-45.1.0-py3-none-any.whl", user),
+    ]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """Build the packages. Return their contents by architecture."""
+    folder = tmp_path_factory.mktemp("deb")
+    wheel, libraries = inputs(folder)
     with pytest.MonkeyPatch.context() as patch:
         # The sources may be without a repository.
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
@@ -339,3 +362,124 @@ def test_no_command_imports_a_library_that_is_left_out() -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+# --- bill of materials
+
+
+def bill_of(package: bytes) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(
+        text(package, f"./usr/share/doc/{make_deb.NAME}/{make_deb.NAME}.cdx.json")
+    )
+    return found
+
+
+def test_the_bill_of_materials_is_valid_cyclonedx(made: dict[str, bytes]) -> None:
+    validation = pytest.importorskip("cyclonedx.validation.json")
+    schema = pytest.importorskip("cyclonedx.schema")
+    validator = validation.JsonStrictValidator(schema.SchemaVersion.V1_6)
+    for package in made.values():
+        assert validator.validate_str(json.dumps(bill_of(package))) is None
+
+
+def test_the_bill_of_materials_lists_core_and_libraries(made: dict[str, bytes]) -> None:
+    bill = bill_of(made["arm64"])
+    own = bill["metadata"]["component"]
+    assert (own["name"], own["version"]) == (make_deb.NAME, make_deb.version())
+    assert own["purl"].endswith("?arch=arm64")
+    assert bill["metadata"]["timestamp"] == "2023-11-14T22:13:20Z"
+    core, bitstruct, cantools = bill["components"]
+    assert core["hashes"] == [{"alg": "SHA-256", "content": hashlib.sha256(b"aarch64").hexdigest()}]
+    assert bitstruct["purl"] == "pkg:pypi/bitstruct@8.24.0"
+    assert cantools["licenses"] == [{"license": {"id": "MIT"}}]
+    depends = {each["ref"]: each["dependsOn"] for each in bill["dependencies"]}
+    assert depends["pkg:pypi/cantools@45.1.0"] == ["pkg:pypi/bitstruct@8.24.0"]
+    assert set(depends[own["bom-ref"]]) == {each["bom-ref"] for each in bill["components"]}
+
+
+def test_the_bill_of_materials_is_beside_the_package_too(tmp_path: Path) -> None:
+    wheel, libraries = inputs(tmp_path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+        package = make_deb.make(wheel, libraries, tmp_path / "out")[0]
+    beside = package.with_suffix(".cdx.json").read_text()
+    assert json.loads(beside) == bill_of(package.read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("head", "licence"),
+    [
+        (
+            "License-Expression: Apache-2.0 OR BSD-2-Clause",
+            {"expression": "Apache-2.0 OR BSD-2-Clause"},
+        ),
+        ("License: LGPL v3", {"license": {"id": "LGPL-3.0-only"}}),
+        ("License: my own", {"license": {"name": "my own"}}),
+        ("Classifier: License :: OSI Approved :: MIT License", {"license": {"id": "MIT"}}),
+        ("Summary: x", None),
+    ],
+)
+def test_a_licence_is_taken_from_the_metadata_of_the_wheel(head: str, licence: object) -> None:
+    assert licence_of(message_from_string(f"Name: x\nVersion: 1\n{head}\n\n")) == licence
+
+
+# --- two builds
+
+ANOTHER_TIME = """
+import time
+_time = time.time
+time.time = lambda: _time() + 40 * 86400
+"""
+
+
+def test_two_builds_in_different_surroundings_are_equal(tmp_path: Path) -> None:
+    """They differ in folder, time, time zone, language, hash seed, umask and order of files."""
+    wheel, libraries = inputs(tmp_path)
+    script = (
+        "import os, sys; os.umask(int(sys.argv[1], 8)); sys.path.insert(0, sys.argv[2]); "
+        "from pathlib import Path; import make_deb; "
+        "make_deb.make(Path(sys.argv[3]), [Path(p) for p in sys.argv[5:]], Path(sys.argv[4]))"
+    )
+    later = tmp_path / "later"
+    later.mkdir()
+    (later / "sitecustomize.py").write_text(ANOTHER_TIME)
+    built = []
+    for number, (umask, environment) in enumerate(
+        (
+            ("022", {"TZ": "UTC", "LC_ALL": "C", "LANG": "C"}),
+            (
+                "077",
+                {
+                    "TZ": "Pacific/Kiritimati",
+                    "LC_ALL": "tr_TR.UTF-8",
+                    "LANG": "de_DE.UTF-8",
+                    "LANGUAGE": "de:fr",
+                    "COLUMNS": "200",
+                    "PYTHONHASHSEED": "77",
+                    "PYTHONPATH": str(later),
+                    "DPKG_DEB_THREADS_MAX": "3",
+                },
+            ),
+        )
+    ):
+        project = tmp_path / ("a" if number else "a/long folder with blanks/and ümlauts")
+        for name in ("deb", "kontronik_can_gw", "dbc", "eds", "CHANGELOG.md", "LICENSE"):
+            source = PROJECT / name
+            copy = shutil.copytree if source.is_dir() else shutil.copyfile
+            (project / name).parent.mkdir(parents=True, exist_ok=True)
+            copy(source, project / name)
+        out = tmp_path / f"out{number}"
+        words = [umask, str(project / "deb"), str(wheel), str(out)]
+        words += map(str, reversed(libraries) if number else libraries)
+        paths = [environment.pop("PYTHONPATH", ""), str(project)]
+        environment |= {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+        subprocess.run(
+            [sys.executable, "-c", script, *words],
+            env=os.environ | environment | {"SOURCE_DATE_EPOCH": "1700000000"},
+            check=True,
+        )
+        built.append({path.name: path.read_bytes() for path in out.iterdir()})
+    assert len(built[0]) == 6
+    assert built[0].keys() == built[1].keys()
+    for name, content in built[0].items():
+        assert content == built[1][name], name
