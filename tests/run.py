@@ -84,6 +84,7 @@ STEPS = {
     "masters": f"{ON_VCAN} -m extended {{args}}",
     "prove": f"{PYTEST} -n 2 tests/proofs {{args}}",
     "qemu": FAULTS.format("qemu"),
+    "outages": FAULTS.format("uml") + " --only=Outage: --outages=20 --hangs=50",
     "soak": FAULTS.format("soak") + " --minutes=240",
     "hour": "python tests/hour/hour_programme.py",
     "put-in": "python tests/mutants/put_in_faults.py",
@@ -97,7 +98,12 @@ TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
     "test-all": (("masters", "faults"), ("tools", "prove")),
     "prove": (("prove",),),
-    "release": (("qemu", "soak", "hour", "put-in", "machines", "fuzz", "proofs", "wheels", "deb"),),
+    "release": (
+        (
+            *("qemu", "outages", "soak", "hour", "put-in"),
+            *("machines", "fuzz", "proofs", "wheels", "deb"),
+        ),
+    ),
 }
 LIMIT_S = {"test": 1800, "test-all": 2400, "prove": 1200, "release": 6 * 3600}
 """Longest duration of one step. The two tiers that CI runs end within its 90 minutes."""
@@ -115,6 +121,7 @@ NEEDS = {
     "vcan": ("ip candump vcan", ENABLE_VCAN),
     "masters": ("ip candump vcan", ENABLE_VCAN),
     "faults": ("linux.uml cc", ENABLE_UML),
+    "outages": ("linux.uml cc", ENABLE_UML),
     "soak": ("linux.uml cc", ENABLE_UML),
     "qemu": ("qemu-system-x86_64", "sudo tests/vm/setup.sh qemu"),
     "wheels": (WHEELS, f"sudo apt-get install {ENABLE_WHEELS}"),

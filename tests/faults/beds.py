@@ -96,8 +96,12 @@ BUS: list[Bus] = []
 """The bus of the bed ``adapters`` while that bed exists."""
 
 
+def adapters(_: Path) -> contextlib.AbstractContextManager[Bench]:
+    return adapters_with()
+
+
 @contextlib.contextmanager
-def adapters(_: Path) -> Iterator[Bench]:
+def adapters_with(rate_hz: float = 25, **options: Any) -> Iterator[Bench]:
     """Yield a bench with one ESC and slow emulated adapters for the gateway and the judge."""
     number = next(_numbers)
     names = f"sl{number}", f"slfar{number}"
@@ -106,7 +110,7 @@ def adapters(_: Path) -> Iterator[Bench]:
         for adapter in BUS[0].adapters:
             run(f"ip link set {adapter.name} txqueuelen 100")
             adapter.up(ADAPTER_RATE)
-        with bench_of([Identity(1)], rate_hz=25, names=names) as bench:
+        with bench_of([Identity(1)], rate_hz=rate_hz, names=names, **options) as bench:
             yield bench
     finally:
         BUS[0].close()

@@ -227,10 +227,12 @@ class Judge:
     def _judge_info(self, received: Received) -> None:
         fed = self.escs[received.esc]
         m = newest = fed.newest_info(received.at_ns + MS)
-        while m >= 0 and received.at_ns - fed.info_sent[m] <= INFO_TIMEOUT_NS + self.slack_ns:
+        limit_ns = INFO_TIMEOUT_NS + self.slack_ns
+        while m >= 0 and received.at_ns - fed.info_sent[m] <= limit_ns + self.more_ns:
             values = fed.values_of_info(m)
             if received.has_values(values):
                 self.values += 1
+                self.by_more += received.at_ns - fed.info_sent[m] > limit_ns
                 if received.message.stem == "Info":
                     self._devices[received.esc] = int(values["device"])
                 return

@@ -202,16 +202,6 @@ def passive(bench: Bench, injection: Injection, _n: int) -> None:
     wait_can_state(ACTIVE)
 
 
-@on_adapter("no other node acknowledges", 1.0)
-def no_acknowledge(bench: Bench, injection: Injection, _n: int) -> None:
-    far = BUS[0].adapters[1]
-    far.down()
-    time.sleep(1.5)
-    injection.cleared()
-    run(f"ip link set {far.name} up")
-    near().tell_state("a", 0, 0)
-
-
 @on_adapter("wrong bit rate", 1.0)
 def wrong_rate(bench: Bench, injection: Injection, _n: int) -> None:
     near().down()
@@ -220,22 +210,6 @@ def wrong_rate(bench: Bench, injection: Injection, _n: int) -> None:
     near().down()
     injection.cleared()
     near().up(ADAPTER_RATE)
-
-
-@on_adapter("an adapter that hangs", 1.0)
-def hanging(bench: Bench, injection: Injection, _n: int) -> None:
-    """Frames that the adapter had taken before it hung are sent late and old.
-
-    Later frames of the gateway are fresh.
-    """
-    bench.watch.more_ns = 3 * SECOND
-    near().stalled = True
-    time.sleep(1.5)
-    near().stalled = False
-    injection.cleared()
-    injection.wait_recovery()
-    time.sleep(0.2)
-    bench.watch.more_ns = 0
 
 
 @on_adapter("adapter unplugged and plugged in again", 1.0)

@@ -34,7 +34,7 @@ class Fault:
 
 FAULTS: list[Fault] = []
 """Every fault. Importing the modules that define faults fills the list."""
-AREAS = ("Start", "Serial", "CAN", "Time", "Process", "Disk", "Traffic", "Many")
+AREAS = ("Start", "Serial", "CAN", "Outage", "Time", "Process", "Disk", "Traffic", "Many")
 GOOD = "good"
 FAILED = "failed"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "fault-programme.md"
@@ -61,6 +61,8 @@ class Row:
     worst_s: float = 0.0
     wrong: int = 0
     lost: int = 0
+    late: int = 0
+    """Most values that arrived late after one outage, because they were in kernel or controller."""
     transmitted: int = 0
     """Bytes that the gateway sent to an ESC."""
     notes: list[str] = field(default_factory=list)
@@ -83,6 +85,8 @@ class Row:
     def text(self) -> str:
         """Return the line for the terminal, and below it the problems."""
         notes = list(self.notes[:8])
+        if self.late:
+            notes.append(f"up to {self.late} values that kernel or controller held arrived late")
         if self.transmitted:
             notes.append(f"{self.transmitted} bytes sent to an ESC")
         return "\n       ".join((str(self), *notes))

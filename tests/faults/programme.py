@@ -26,6 +26,7 @@ from pathlib import Path
 
 import beds
 import can_faults  # noqa: F401  registers its faults, as the others do
+import outage_faults
 import process_faults  # noqa: F401
 import qemu_faults  # noqa: F401
 import serial_faults  # noqa: F401
@@ -35,7 +36,7 @@ from memory_slope import Sample, faults_in, slope_kib_per_hour
 
 PROJECT = Path(__file__).resolve().parents[2]
 REPORT = "report.json"
-TIMEOUT_S = {"uml": 1500, "qemu": 600}
+TIMEOUT_S = {"uml": 2300, "qemu": 600}
 NEW_PROCESS = ("missing at start", "kill -9", "SIGTERM", "frozen")
 """Faults that end the gateway, so that its memory could not be followed."""
 MAX_GROWTH_KIB = 2048
@@ -49,6 +50,7 @@ def run_inside(args: argparse.Namespace) -> Report:
     """Run this script in a virtual machine. Return its rows."""
     with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
         timeout_s = TIMEOUT_S.get(args.part, 180 * args.minutes + 300)
+        timeout_s *= max(1, args.outages // 4)
         words = [
             sys.executable,
             PROJECT / "tests/vm/vm_run.py",
@@ -63,6 +65,8 @@ def run_inside(args: argparse.Namespace) -> Report:
             f"--inside={folder}",
             f"--seed={args.seed}",
             f"--minutes={args.minutes:g}",
+            f"--outages={args.outages}",
+            f"--hangs={args.hangs}",
             *(f"--only={text}" for text in args.only),
         ]
         subprocess.run(list(map(str, words)), stdin=subprocess.DEVNULL, check=False)
@@ -161,9 +165,12 @@ def main() -> int:
     parser.add_argument("--page", action="store_true", help="write it to docs/fault-programme.md")
     parser.add_argument("--only", action="append", default=[], help="faults with this text")
     parser.add_argument("--minutes", type=float, default=10)
+    parser.add_argument("--outages", type=int, default=2, help="number of lengths of outages")
+    parser.add_argument("--hangs", type=int, default=4, help="number of hanging adapters")
     parser.add_argument("--seed", type=int, default=random.SystemRandom().randrange(1 << 32))
     parser.add_argument("--inside", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
+    outage_faults.choose(args.outages, args.hangs)
     if args.part == "soak":
         faults = [SOAK]
     else:
