@@ -368,3 +368,10 @@ def test_lines_of_any_document_contain_no_terminal_controls(
     seen = judge(Path("x"), document, WHOLE["monotonic_ns"])
     assert seen.code in (HEALTHY, TROUBLE, NOT_RUNNING)
     assert all(line.plain.isprintable() for line in lines_of(seen))
+
+
+def test_a_text_in_place_of_a_time_is_not_multiplied() -> None:
+    """The product would be larger than the memory."""
+    document: Any = json.loads(json.dumps(WHOLE))
+    document["process"]["uptime_s"] = "x" * 1_000_000
+    assert judge(Path("x"), document, WHOLE["monotonic_ns"]).document is None

@@ -33,7 +33,7 @@ from kontronik_can_gw.runtime.status.snapshot import FORMAT, PROGRAM, STALE_NS
 from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.runtime.system.clock import ClockFacts, step_in_words
 from kontronik_can_gw.runtime.system.fault_log import duration
-from kontronik_can_gw.times import MS, SECOND
+from kontronik_can_gw.times import SECOND
 
 HEALTHY = 0
 TROUBLE = 1
@@ -222,7 +222,7 @@ def _troubles(document: Document) -> Iterator[str]:
             continue  # a parked vehicle has no telemetry
         if not port["open"]:
             lost = port["lost_for_s"]
-            since = "" if lost is None else f" for {duration(round(lost * SECOND))}"
+            since = "" if lost is None else f" for {_duration(lost)}"
             complaint = (port["complaint"] or "").removeprefix(f"{esc['name']}: ")
             reason = f"port not open{since}: {complaint or port['path']}"
         if not esc["fresh"]:
@@ -270,7 +270,7 @@ def _head(seen: Seen, document: Document) -> Iterator[Text]:
     gateway = document["gateway"]
     style = "bold green" if seen.code == HEALTHY else "bold yellow"
     state = (seen.sentence, style)
-    up = duration(round(process["uptime_s"] * SECOND))
+    up = _duration(process["uptime_s"])
     escs = f"{gateway['escs_ok']} of {gateway['esc_count']} ESCs heard, up {up}"
     yield line(f"{PROGRAM} {document['version']}  ", state, f"  {escs}")
     memory = f"{process['rss_bytes'] // 1_000_000} MB"
@@ -341,10 +341,21 @@ def _esc_rows(document: Document) -> Iterator[list[Part]]:
         ]
 
 
+def _duration(seconds: float) -> str:
+    """Return a duration as text.
+
+    Raises TypeError or ValueError for other values. A text is not multiplied, because the result
+    would fill the memory.
+    """
+    return duration(round(float(seconds) * SECOND))
+
+
 def _age(age_ms: float | None) -> str:
     if age_ms is None:
         return "-"
-    return f"{age_ms:.0f} ms" if age_ms < 1000 else duration(round(age_ms * MS))
+    if age_ms < 1000:
+        return f"{age_ms:.0f} ms"
+    return _duration(age_ms / 1000)
 
 
 def alarms(document: Document) -> list[tuple[str, Alarm]]:
