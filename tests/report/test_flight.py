@@ -16,7 +16,8 @@ from simulated_bus import layout_of
 
 from kontronik_can_gw.desk.recordings.fields import ColumnType, Field
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.desk.report.esc import EscFlight, FlightEvent, FlightEvents
+from kontronik_can_gw.desk.report.esc import EscFlight
+from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import render
 from kontronik_can_gw.desk.report.quantities import MINIMA

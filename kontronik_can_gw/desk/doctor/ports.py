@@ -51,12 +51,8 @@ def check_port(
     hardware = f"/sys/class/tty/{tty}"
     is_pty = real.startswith("/dev/pts/")
     if status is None or not _is_port(machine, status, hardware, is_pty):
-        named = ", ".join(machine.names("/dev/serial/by-id"))
-        there = ""
-        if named:
-            there = f". Available in /dev/serial/by-id: {named}"
         case = "no_port" if status else "none"
-        findings.add("port.exists", case, there=there)
+        findings.add("port.exists", case, there=_available(machine))
         return findings.found
     usb = _adapter(machine, machine.real(f"{hardware}/device"))
     what = tty
@@ -88,6 +84,14 @@ def _is_port(machine: Machine, status: os.stat_result, hardware: str, is_pty: bo
     if not stat.S_ISCHR(status.st_mode):
         return False
     return is_pty or machine.exists(hardware)
+
+
+def _available(machine: Machine) -> str:
+    """Return a sentence that lists the serial adapters. Empty if there are none."""
+    names = machine.names("/dev/serial/by-id")
+    if not names:
+        return ""
+    return f". Available in /dev/serial/by-id: {', '.join(names)}"
 
 
 def _permission(machine: Machine, port: str, status: os.stat_result) -> str:

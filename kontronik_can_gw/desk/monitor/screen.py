@@ -4,11 +4,11 @@ It is a table of all ESCs, or the page of one ESC with all its values. Pure.
 """
 
 from collections.abc import Iterator, Sequence
-from math import inf
 
 from rich.text import Text
 
 from kontronik_can_gw.desk.member import Alarm, Flag, alarms_of
+from kontronik_can_gw.desk.monitor.charts import MARKS, chart_heights, chart_rows, sparkline
 from kontronik_can_gw.desk.monitor.lines import (
     STATES,
     Part,
@@ -36,9 +36,6 @@ from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.runtime.system.fault_log import duration
 from kontronik_can_gw.times import MS
 
-_LEVELS = "▁▂▃▄▅▆▇█"
-_MARKS = {"": "bold", "!": "bold yellow", "!!": "bold red"}
-"""Styles of marked values. The marks themselves are for displays without colour."""
 _NO_TELEMETRY = "no telemetry{since}: is the ESC powered and its cable plugged in?"
 _TROUBLES = {
     "searching": (
@@ -67,7 +64,6 @@ _ALARM_LINES = 6
 """Lines that a page reserves for errors and warnings."""
 _FEW_ALARM_LINES = 2
 """Lines for errors and warnings below the table of all ESCs if room is short."""
-_MAX_CHART_LINES = 8
 
 
 def screen(
@@ -215,7 +211,7 @@ def _name_part(esc: Esc, width: int | None = None) -> Part:
     name = esc.name
     if width is not None:
         name = shorten(name, width - len(suffix))
-    return name + suffix, _MARKS[mark]
+    return name + suffix, MARKS[mark]
 
 
 def _value_part(esc: Esc, quantity: Quantity) -> Part:
@@ -225,41 +221,7 @@ def _value_part(esc: Esc, quantity: Quantity) -> Part:
     if value is None:
         return text, "dim"
     mark = quantity.mark(value)
-    return mark + text, _MARKS[mark]
-
-
-def sparkline(esc: Esc, quantity: Quantity, width: int, height: int = 1) -> list[Text]:
-    """Return a chart of the last ``width`` seconds of a value, with the newest at the right.
-
-    It is scaled to the extremes of the value. It has ``height`` lines, the top one first.
-    """
-    track = esc.tracks[quantity.source]
-    values: list[float | None] = []
-    if width:
-        values = list(track.history)[-width:]
-    scale = [value for value in (*values, track.low, track.high) if value is not None]
-    low = min(scale, default=0.0)
-    high = max(scale, default=0.0)
-    span = high - low
-    steps = len(_LEVELS) * height
-    made = [line() for _ in range(height)]
-    for value in values:
-        filled = 0
-        style = ""
-        if value is not None:
-            part = 0.0
-            if 0 < span < inf:
-                part = (value - low) / span
-            filled = 1 + round(part * (steps - 1))
-            mark = quantity.mark(value)
-            style = _MARKS[mark] if mark else "cyan"
-        for above, each in enumerate(reversed(made)):
-            level = filled - above * len(_LEVELS)
-            character = " "
-            if level > 0:
-                character = _LEVELS[min(level, len(_LEVELS)) - 1]
-            each.append(character, style)
-    return made
+    return mark + text, MARKS[mark]
 
 
 def _trouble(esc: Esc) -> Flag | None:
@@ -312,7 +274,7 @@ def _page(esc: Esc, width: int, height: int) -> list[Text]:
     heads = ("", "", "now", "min", "max", f"last {seconds} s")
     rows: list[list[Part]] = [[(text, "dim") for text in heads]]
     shown = [quantity for quantity in QUANTITIES if esc.has(quantity.source)]
-    heights = _chart_heights(len(shown), height - len(head) - 1)
+    heights = chart_heights(len(shown), height - len(head) - 1)
     for quantity, lines in zip(shown, heights, strict=True):
         track = esc.tracks[quantity.source]
         cells: list[Part] = [
@@ -323,7 +285,7 @@ def _page(esc: Esc, width: int, height: int) -> list[Text]:
             number(track.high, quantity.digits),
         ]
         chart = sparkline(esc, quantity, seconds, lines)
-        rows += _chart_rows(cells, chart)
+        rows += chart_rows(cells, chart)
     least = (*_PAGE_WIDTHS, seconds)
     return head + table(rows, width, 2, least)
 
@@ -355,30 +317,6 @@ def _page_head(esc: Esc) -> list[Text]:
     return [head, line((about, "dim"))]
 
 
-def _chart_heights(count: int, height: int) -> list[int]:
-    """Distribute ``height`` lines among ``count`` charts, at least one line for each.
-
-    The first charts get one line more if lines are left.
-    """
-    each, more = divmod(height, max(1, count))
-    heights = []
-    for index in range(count):
-        lines = each
-        if index < more:
-            lines += 1
-        lines = min(lines, _MAX_CHART_LINES)
-        heights.append(max(1, lines))
-    return heights
-
-
-def _chart_rows(cells: Sequence[Part], chart: Sequence[Text]) -> Iterator[list[Part]]:
-    """Yield the rows of a table whose last column is a chart. The first row has the cells."""
-    blank = [""] * len(cells)
-    for index, part in enumerate(chart):
-        first = blank if index else cells
-        yield [*first, part]
-
-
 def _histories(escs: Sequence[Esc], width: int, height: int) -> list[Text]:
     """Return an empty line and charts of the most important quantities of all ESCs.
 
@@ -397,7 +335,7 @@ def _histories(escs: Sequence[Esc], width: int, height: int) -> list[Text]:
     seconds = min(HISTORY_S, width - sum(widths) - len(widths))
     if not charts or seconds <= 0:
         return []
-    lines = min(_chart_heights(len(charts), chart_lines))
+    lines = min(chart_heights(len(charts), chart_lines))
     heads = ("ESC", "", "", "now", f"last {seconds} s")
     rows: list[list[Part]] = [[(text, "dim") for text in heads]]
     for quantity, esc in charts:
@@ -408,7 +346,7 @@ def _histories(escs: Sequence[Esc], width: int, height: int) -> list[Text]:
             _value_part(esc, quantity),
         ]
         chart = sparkline(esc, quantity, seconds, lines)
-        rows += _chart_rows(cells, chart)
+        rows += chart_rows(cells, chart)
     least = (*widths, seconds)
     return [line(), *table(rows, width, 3, least)]
 

@@ -4,15 +4,15 @@ A value is valid until the next row. Nothing is counted while telemetry is lost.
 recording's clock.
 """
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import compress, repeat
 from math import isfinite
-from operator import attrgetter, ne
-from typing import Any, Literal, NamedTuple
+from operator import ne
+from typing import Any, NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import ColumnType, Field
+from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
 from kontronik_can_gw.desk.report.quantities import (
     COMPUTED_FROM,
     COUNTERS,
@@ -22,7 +22,7 @@ from kontronik_can_gw.desk.report.quantities import (
     PHASES,
     SPEEDS,
 )
-from kontronik_can_gw.esc.decoder import State
+from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
@@ -47,9 +47,6 @@ _WORD_BITS = 32
 Columns = dict[str, Sequence[Any]]
 """Values of the rows of a chunk by source. None: not available."""
 Number = int | float | None
-EventKind = Literal["error", "state", "link", "device"]
-MAX_EVENTS = 5000
-"""Number of events of each kind that are kept. Further events are only counted."""
 
 
 class Extreme(NamedTuple):
@@ -57,65 +54,6 @@ class Extreme(NamedTuple):
 
     value: float
     time_ns: int
-
-
-@dataclass(slots=True)
-class FlightEvent:
-    """An event of an ESC."""
-
-    kind: EventKind
-    esc: int
-    begin_ns: int
-    text: str
-    severity: str = "status"
-    remedy: str = ""
-    end_ns: int | None = None
-    """None if the event lasts until the end. Equal to ``begin_ns`` if it has no duration."""
-    note: str = ""
-    """A remark about its end, if the end is not obvious."""
-    phase: int | None = None
-    """Index in PHASES of an operating state. None for other events."""
-
-
-class FlightEvents:
-    """The events of all ESCs. An event that lasts is stored under a key until it is ended."""
-
-    def __init__(self) -> None:
-        self._kept: dict[EventKind, list[FlightEvent]] = {
-            "error": [],
-            "state": [],
-            "link": [],
-            "device": [],
-        }
-        self._open: dict[Hashable, FlightEvent] = {}
-        self.left_out = 0
-
-    def begin(self, key: Hashable, event: FlightEvent) -> None:
-        """Add an event that lasts until ``end`` is called with its key."""
-        self._open[key] = event
-        if len(self._kept[event.kind]) < MAX_EVENTS:
-            self._kept[event.kind].append(event)
-        else:
-            self.left_out += 1
-
-    def end(self, key: Hashable, time_ns: int, *, lost: bool = False) -> None:
-        """End an event, if there is one under the key.
-
-        ``lost``: the cause is a loss of telemetry, so the condition itself may continue.
-        """
-        event = self._open.pop(key, None)
-        if event is None:
-            return
-        event.end_ns = time_ns
-        if lost:
-            event.note = "until telemetry was lost"
-
-    def in_order(self) -> list[FlightEvent]:
-        """Return all events, sorted by their begin."""
-        found: list[FlightEvent] = []
-        for events in self._kept.values():
-            found += events
-        return sorted(found, key=attrgetter("begin_ns", "esc"))
 
 
 class _ErrorColumn(NamedTuple):
@@ -133,11 +71,7 @@ class EscFlight:
     """The results of one ESC. A number is None if the recording does not have it."""
 
     def __init__(
-        self,
-        index: int,
-        settings: EscSettings,
-        fields: Sequence[Field],
-        events: FlightEvents,
+        self, index: int, settings: EscSettings, fields: Sequence[Field], events: FlightEvents
     ) -> None:
         self.name = settings.name
         self.telemetry_ns = 0
@@ -164,22 +98,17 @@ class EscFlight:
         own_fields = [fields[place] for place in self._columns.values()]
         self.computed = _values_to_compute(own_fields)
         """Values that the recording has less often than the values from which they follow."""
-        self._floats: set[str] = set()
+        self._floats = _float_signals(fields)
         """Values in CAN frames that may be infinite, which means not available."""
-        for field in fields:
-            if field.signal and field.kind is ColumnType.FLOAT:
-                self._floats.add(field.source)
-        live = [source for source in LIVE if source in self._columns]
-        self._live = live[0] if live else None
-        self._words = self._error_words()
-        known = self._known_sources()
+        self._live = next((source for source in LIVE if source in self._columns), None)
+        self._words = _error_columns(self._protocol, self._columns)
+        known = _known_sources(self._columns)
         self.drawn = [source for source in DRAWN if source in known]
         self.has_errors = bool(self._words)
         self.has_power = "battery_power" in known
         self.has_speed = not known.isdisjoint(SPEEDS)
-        self._state_of_name: dict[str, State] = {}
-        for state in self._protocol.states.values():
-            self._state_of_name[normalize(state.text)] = state
+        states = self._protocol.states.values()
+        self._state_of_name = {normalize(state.text): state for state in states}
         self._last: dict[str, Any] = {"gap": True}
         """The last value of each column whose changes are followed."""
         self._counts: dict[str, float] = {}
@@ -221,31 +150,6 @@ class EscFlight:
         self._find_extremes(times, columns)
         self._add_up(times, present, columns)
         return [columns[source] for source in self.drawn]
-
-    def _known_sources(self) -> set[str]:
-        """Return the sources in the recording, and those that can be computed from them."""
-        known = set(self._columns)
-        if "battery_voltage" in known:
-            known.add("mean_cell_voltage")
-            if "battery_current" in known:
-                known.add("battery_power")
-        return known
-
-    def _error_words(self) -> list[_ErrorColumn]:
-        """Return the columns with errors.
-
-        A column is a whole error word, or a flag if the recording does not have the word.
-        """
-        found = []
-        for word, bits in self._protocol.errors.items():
-            if word in self._columns:
-                found.append(_ErrorColumn(word, word, range(_WORD_BITS), 0))
-                continue
-            for bit in bits:
-                if bit.text in self._columns:
-                    column = _ErrorColumn(bit.text, word, (int(bit),), int(bit))
-                    found.append(column)
-        return found
 
     def _changes(self, key: str, values: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         """Yield row and new value of each change of a column, also between chunks."""
@@ -454,6 +358,42 @@ def _first_fields(fields: Sequence[Field], esc: int) -> dict[str, int]:
     for index, field in enumerate(fields):
         if field.esc == esc:
             found.setdefault(field.source, index)
+    return found
+
+
+def _known_sources(columns: Iterable[str]) -> set[str]:
+    """Return the sources in the recording, and those that can be computed from them."""
+    known = set(columns)
+    if "battery_voltage" in known:
+        known.add("mean_cell_voltage")
+        if "battery_current" in known:
+            known.add("battery_power")
+    return known
+
+
+def _error_columns(protocol: EscProtocol, columns: Container[str]) -> list[_ErrorColumn]:
+    """Return the columns with errors.
+
+    A column is a whole error word, or a flag if the recording does not have the word.
+    """
+    found = []
+    for word, bits in protocol.errors.items():
+        if word in columns:
+            found.append(_ErrorColumn(word, word, range(_WORD_BITS), 0))
+            continue
+        for bit in bits:
+            if bit.text in columns:
+                column = _ErrorColumn(bit.text, word, (int(bit),), int(bit))
+                found.append(column)
+    return found
+
+
+def _float_signals(fields: Iterable[Field]) -> set[str]:
+    """Return the values that are floats in CAN frames."""
+    found = set()
+    for field in fields:
+        if field.signal and field.kind is ColumnType.FLOAT:
+            found.add(field.source)
     return found
 
 

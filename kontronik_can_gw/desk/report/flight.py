@@ -12,14 +12,8 @@ from typing import NamedTuple
 
 from kontronik_can_gw.desk.recordings.fields import Field, column_of
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Block
-from kontronik_can_gw.desk.report.esc import (
-    DEVICE,
-    LIVE,
-    EscFlight,
-    FlightEvent,
-    FlightEvents,
-    Number,
-)
+from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight, Number
+from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
 from kontronik_can_gw.desk.report.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
