@@ -137,8 +137,8 @@ static int are_equal(const kcg_esc *a, const kcg_esc *b)
            (!blames || (a->blame == b->blame && a->blame_until == b->blame_until));
 }
 
-/* Feeds the symbols from `cut` to `size` to a deframer that has taken those before. The memory around
-   them has other symbols than the stream. */
+/* Feeds the symbols from `cut` to `size` to a deframer that has received the symbols before. The
+   memory around them has other symbols than the stream. */
 static kcg_esc fed(uint32_t cut, uint32_t size)
 {
     kcg_esc e = state[cut];

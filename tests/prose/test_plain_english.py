@@ -44,7 +44,7 @@ LIMITS: dict[str, dict[str, float]] = {
         "that-of": 0.4,
         "where-for-if": 0.2,
         "fragment-of": 0.1,
-        "animated": 3.7,
+        "animated": 3.5,
         "nobody-none": 0.4,
         "but-for": 0.3,
         "lines over 100 columns": 0,
