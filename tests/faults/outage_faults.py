@@ -6,10 +6,10 @@ restarted, the other keeps and sends them.
 """
 
 import contextlib
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,7 +65,6 @@ def choose(lengths: int, hangs: int) -> None:
 choose(2, 4)
 UNITS: list[RestartUnit] = []
 """The restart unit of the bed ``with_unit`` while that bed exists."""
-_numbers = count()
 
 
 def without_unit(_: Path) -> contextlib.AbstractContextManager[Bench]:
@@ -73,9 +72,12 @@ def without_unit(_: Path) -> contextlib.AbstractContextManager[Bench]:
 
 
 @contextlib.contextmanager
-def with_unit(folder: Path) -> Iterator[Bench]:
-    """Yield the bench of ``adapters`` with a gateway that requests restarts, and the unit."""
-    run = folder / f"run{next(_numbers)}"
+def with_unit(_: Path) -> Iterator[Bench]:
+    """Yield the bench of ``adapters`` with a gateway that requests restarts, and the unit.
+
+    The file of the requests is on a file system of the virtual machine, whose times are virtual.
+    """
+    run = Path(tempfile.mkdtemp(prefix="run."))
     can = f"restart_after_s = {RESTART_AFTER_S}\n"
     environment = {"KONTRONIK_RUN": str(run)}
     made = beds.adapters_with(RATE_HZ, can=can, environment=environment)
