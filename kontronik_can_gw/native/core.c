@@ -879,7 +879,8 @@ static void mark(kcg *g, uint32_t i, int64_t since, int why)
 {
     kcg_sending *s = &g->sending[i];
     if (!s->why) {
-        g->pending[g->pendings++] = (uint16_t)i;
+        g->pending[g->pendings] = (uint16_t)i;
+        g->pendings++;
         s->since = since;
     } else if (since < s->since) {
         s->since = since;
@@ -1254,7 +1255,7 @@ static void advance_messages(kcg *g, int64_t now)
             continue;
         }
         if (s->cycle_due == when) {
-            s->cycle_due += m->cycle * ((now - when) / m->cycle + 1);
+            s->cycle_due = now + m->cycle - (now - when) % m->cycle;
             moved(g, i);
             if (may_go(g, i, now)) {
                 mark(g, i, when, CYCLE);
@@ -1494,8 +1495,10 @@ static void report(kcg *g, int esc, int events, int64_t now)
         }
     }
     if ((unsigned)events & g->mask) {
-        if (!g->esc[esc].reported)
-            g->report[g->reports++] = (uint8_t)esc;
+        if (!g->esc[esc].reported) {
+            g->report[g->reports] = (uint8_t)esc;
+            g->reports++;
+        }
         g->esc[esc].reported = (uint8_t)(g->esc[esc].reported | events);
     }
 }
