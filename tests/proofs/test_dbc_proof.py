@@ -127,7 +127,7 @@ def test_a_layout_that_only_python_can_send_is_proven_for_python(tmp_path: Path)
     found = proof_of(path)
     assert found["refuted"] == []
     assert found["proven"] == ["LeftWide.LeftOutputSpeed", "RightWide.RightOutputSpeed"]
-    assert "leaves 64 bits" in found["only_python"]
+    assert "exceeds 64 bits" in found["only_python"]
     assert "the core in Python, because" in run("check", "--prove", path).out
 
 
