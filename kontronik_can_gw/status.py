@@ -66,7 +66,7 @@ class GatewayStatus:
     can_restarts: int = 0
     """Restarts of the CAN interface that were requested because no frame left it."""
     heard_ns: int = 0
-    """Last time at which an ESC was heard, or the start. Old while there are live data."""
+    """Time of the last live data, or of the start. Only updated when all data have expired."""
     is_quiet: bool = False
     """True in quiet mode. The core writes this and ``heard_ns``."""
 

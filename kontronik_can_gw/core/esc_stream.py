@@ -163,7 +163,7 @@ class EscStream(EscTelemetry):
         return min(self._window_ns + SECOND, self.expiry())
 
     def expiry(self) -> int:
-        """Return the time at which live or info data are too old, or NEVER."""
+        """Return the time at which live or info data expire, or NEVER."""
         deadline = NEVER
         if self.live is not None:
             deadline = min(deadline, self.live_bound_ns + self.settings.timeout_ns + 1)

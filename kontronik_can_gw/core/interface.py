@@ -90,7 +90,7 @@ class Core(Protocol):
 
         Quiet mode begins when no ESC has been heard for the configured time. The messages with
         values of the gateway are sent for the last time then, and nothing else becomes pending
-        (``status.is_quiet``). The first call with live data ends it. Both changes are reported as
+        (``status.is_quiet``). Live data of any ESC end it. Both changes are reported as
         ``Event.QUIET``.
         """
 

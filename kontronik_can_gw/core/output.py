@@ -134,7 +134,7 @@ class Output:
         return None
 
     def set_quiet(self, is_quiet: bool, now: int) -> None:
-        """Begin or end quiet mode, in which an output only answers requests.
+        """Begin or end quiet mode. Outputs only answer requests then.
 
         Slots rest by themselves. All other calls continue, also ``can_returned``, but no frame
         except an answer may be made, and no deadline returned for one. When quiet mode ends,

@@ -150,13 +150,13 @@ class PythonCore:
 
     def _change_quiet(self, now: int) -> None:
         """Begin quiet mode, or end it."""
-        is_quiet = self.status.is_quiet = not self.status.is_quiet
+        is_quiet = not self.status.is_quiet
+        self.status.is_quiet = is_quiet
         self._next_expiry = 0
-        before, after = GatewayState.QUIET, GatewayState.RUNNING
-        if is_quiet:
-            before, after = after, before
-        if self.status.state is before:
-            self.status.state = after
+        if is_quiet and self.status.state is GatewayState.RUNNING:
+            self.status.state = GatewayState.QUIET
+        elif not is_quiet and self.status.state is GatewayState.QUIET:
+            self.status.state = GatewayState.RUNNING
         self.slots.set_quiet(is_quiet)
         if is_quiet:
             self.messages.begin_quiet(now)

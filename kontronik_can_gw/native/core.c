@@ -1466,7 +1466,7 @@ void kcg_sent(kcg *g, int64_t now, uint32_t count)
 
 /* --- the core (twin: core/python_core.py) ----------------------------------------------------- */
 
-/* Returns the time of the newest live frame. */
+/* The time of the newest live frame. */
 static int64_t last_heard(const kcg *g)
 {
     int64_t last = 0;

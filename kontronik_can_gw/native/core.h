@@ -113,12 +113,12 @@ enum {
     KCG_ID_CONFLICTS,
     KCG_STARTED_NS, /* Time of kcg_init. */
     KCG_CAN_RESTARTS,
-    KCG_HEARD_NS,   /* Last time at which an ESC was heard, or that of kcg_init. Old while there
-                       are live data. */
+    KCG_HEARD_NS,   /* Time of the last live data, or of kcg_init. It is only updated when all
+                       live data have expired. */
     KCG_IS_QUIET,   /* 1: quiet mode, in which nothing becomes pending. */
     KCG_OF_GATEWAY_COUNT
 };
-/* Values of KCG_GATEWAY_STATE that the core knows. */
+/* States in KCG_GATEWAY_STATE. */
 enum {
     KCG_STATE_RUNNING = 1,
     KCG_STATE_QUIET = 4
@@ -268,7 +268,7 @@ typedef struct {
     uint32_t words;                        /* Length of `constant`. */
     uint16_t messages, escs, pages, slots; /* In `message`, the slots follow the messages. */
     const kcg_slot_row *slot_row;
-    /* Quiet mode begins when no ESC has had live data for this time in ns. 0: never. The messages
+    /* Quiet mode begins after this time in ns without live data of any ESC. 0: never. The messages
        with values of the gateway are sent for the last time, and then nothing is sent. Live data
        of an ESC end it. KCG_GATEWAY_STATE changes from KCG_STATE_RUNNING to KCG_STATE_QUIET and
        back. */

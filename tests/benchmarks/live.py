@@ -217,7 +217,7 @@ def silent_gateway(stack: ExitStack, folder: Path, escs: int, config: str, can: 
 
 _QUIET = "quiet_after_s = 1"
 _SETTLED_S = 3.0
-"""Time from the first frame until quiet mode has begun, and the start is over."""
+"""Pause after the first frame. Quiet mode begins within it."""
 
 
 def silent_us(context: Context, escs: int, config: str, can: str) -> float:

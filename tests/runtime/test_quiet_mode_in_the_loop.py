@@ -76,7 +76,7 @@ def test_the_loop_wakes_about_once_a_second_in_quiet_mode(monkeypatch: pytest.Mo
 
 
 def test_telemetry_ends_quiet_mode_at_its_second_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first frame may have waited for a second, because the loop sleeps for so long."""
+    """The first frame may be a second old, because the loop sleeps."""
     bench = Bench(monkeypatch)
     bench.run(QUIET_AFTER_S + 10.3)
     begun = bench.world.now

@@ -191,11 +191,10 @@ class CanLink:
         text = f"CAN {self.config.interface} {self.config.channel} is open"
         if self._conditions.is_on(self.opening_condition):
             self._conditions.end(self.opening_condition, text, now)
-        elif self._gateway.status.is_quiet:
-            self._conditions.end(self.condition, text, now)
         elif not self._conditions.is_on(self.condition):
             # After a failure, the recovery is logged when the first frame is sent.
             self._conditions.log(logging.INFO, text)
+        self._quiet.opened(self.condition, text, now)
 
     def _close_port(self) -> None:
         self.transmitter.forget_failures()
@@ -288,22 +287,18 @@ class CanLink:
         return self._stuck.is_stuck(self.port)
 
     def transmit(self, now: int) -> None:
-        """Hand the due frames to the interface until it refuses one.
-
-        In bus-off frames are held, because they would be lost, or sent late after the restart.
-        """
-        port, transmitter = self.port, self.transmitter
+        """Hand the due frames to the interface until it refuses one. In bus-off they are held."""
+        port = self.port
         self._quiet.follow(now)
         if port is None or self.controller.is_off:
-            transmitter.hold(now)
-            transmitter.forget_failures()
+            self.transmitter.hold(now)  # they would be lost, or sent late after the restart
+            self.transmitter.forget_failures()
             off_since = self.controller.stays_off_since
             if port is not None and off_since is not None:
                 self._restart.follow(off_since, now)
             return
-        is_silent = self._quiet.is_silent(port, now)
-        answer = None if is_silent else transmitter.transmit(port, now)
-        self._restart.follow(transmitter.outage_since, now)
+        answer = self._quiet.transmit(port, now)
+        self._restart.follow(self.transmitter.outage_since, now)
         if answer is None:
             return
         if answer is _OK:

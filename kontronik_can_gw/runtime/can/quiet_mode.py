@@ -4,6 +4,7 @@ import logging
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.runtime.can.can_port import CanPort
 from kontronik_can_gw.runtime.can.transmitter import LASTING_BUSY_NS, Transmitter
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
@@ -49,8 +50,8 @@ class QuietMode:
         else:
             self._end(now)
 
-    def is_silent(self, port: CanPort, now: int) -> bool:
-        """Return True if nothing may be handed over: quiet mode during an outage.
+    def transmit(self, port: CanPort, now: int) -> Sent | None:
+        """Send due frames (``Transmitter.transmit``), but nothing in quiet mode during an outage.
 
         A first frame would keep the bus awake. Instead, a frame that leaves the interface, or a
         request that was received, shows that the bus works. Its answer is sent in the next turn.
@@ -58,7 +59,7 @@ class QuietMode:
         transmitter = self._transmitter
         gateway = self._gateway
         if not (self._is_on and gateway.is_held):
-            return False
+            return transmitter.transmit(port, now)
         departures = transmitter.departures
         has_left = departures.check(port.frames_left(), now, transmitter.check_period_ns)
         if has_left or gateway.output_frames:
@@ -66,7 +67,12 @@ class QuietMode:
         else:
             is_empty = departures.waits_since == NEVER
             transmitter.due = NEVER if is_empty else now + LASTING_BUSY_NS
-        return True
+        return None
+
+    def opened(self, fault: str, text: str, now: int) -> None:
+        """End the fault of an interface that was opened, because no frame may be sent for days."""
+        if self._is_on:
+            self._conditions.end(fault, text, now)
 
     def _begin(self, now: int) -> None:
         self._transmitter.drop_measurements()

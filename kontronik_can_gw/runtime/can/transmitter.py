@@ -172,7 +172,7 @@ class Transmitter:
             self.begin_outage(since, now)
 
     def begin_outage(self, since: int, now: int) -> None:
-        """Follow the gateway, which holds its frames from now on. ``since``: time of the cause."""
+        """Follow a gateway that has begun to hold its frames. The cause began at ``since``."""
         self._held_since = since
         self._discard_due = now + LASTING_BUSY_NS
         self._first_frame_at = None
