@@ -71,8 +71,9 @@ class CanConfig:
     data_bitrate: int = key(integer(10_000, 8_000_000), 2_000_000,
         "bit rate of CAN FD's data phase in bit/s")
     restart_after_s: float = key(number(0.3, 3600, or_zero=True), 0.0,
-        "restart a SocketCAN interface from which no frame has left for this time in seconds, which discards old "
-        "frames. It needs the unit kontronik-can-gw-restart@.path. 0 never restarts it")
+        "restart a SocketCAN interface from which no frame has left for this time in seconds, "
+        "which discards old frames. It needs the unit kontronik-can-gw-restart@.path. "
+        "0 never restarts it")
     options: Mapping[str, str | float] = key(options("can", _OF_CAN), {},
         "more options of the python-can interface, for example host or ttyBaudrate. "
         "SocketCAN has none")

@@ -60,8 +60,8 @@ class DbcConfig:
         "'Signal' or 'Message.Signal' = its source, for example 'battery_voltage' or "
         "'left.battery_voltage', or a constant number")
     e2e: Mapping[str, str] = key(table_of(choice(*PROFILES)), {},
-        "name of a message = its AUTOSAR E2E profile; '*' stands for any characters, and an exact name "
-        "has priority (default: the profile that the DBC's attributes state)")
+        "name of a message = its AUTOSAR E2E profile; '*' stands for any characters, and an exact "
+        "name has priority (default: the profile that the DBC's attributes state)")
     e2e_data_ids: Mapping[str, int | Sequence[int]] = key(table_of(_DATA_IDS), {},
         "name of a message = its AUTOSAR E2E data id, or a list of 16 for profiles 2 and 22 "
         "(default: the DBC's attribute; profile 1A: the CAN id)")

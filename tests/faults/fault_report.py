@@ -40,9 +40,16 @@ FAILED = "failed"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "fault-programme.md"
 BEGIN = "<!-- faults begin -->\n"
 END = "<!-- faults end -->\n"
-HEAD = f"""| machine, fault | injected | recovered | worst recovery | wrong values | values lost | state |
-{"|---" * 7}|
-"""
+_COLUMNS = (
+    "machine, fault",
+    "injected",
+    "recovered",
+    "worst recovery",
+    "wrong values",
+    "values lost",
+    "state",
+)
+HEAD = f"| {' | '.join(_COLUMNS)} |\n{'|---' * len(_COLUMNS)}|\n"
 
 
 def in_order() -> list[Fault]:

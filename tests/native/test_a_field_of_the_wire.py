@@ -18,6 +18,8 @@ PACKAGE = Path(__file__).resolve().parents[2] / "kontronik_can_gw"
 FIRST_OF_LIVE = "    electrical_speed: ElectricalSpeed = 0\n"
 LAST_OF_INFO = "    max_bec_temperature: Temperature = 0\n"
 SENT = (0, 1, 100, 127, 7)
+NOTE = "/* 0.1 V; new */"
+"""Comment of the generated line."""
 """Values that every type holds."""
 SHOW = """
 import json, sys
@@ -88,8 +90,8 @@ print(json.dumps({
 @pytest.mark.parametrize(
     ("before", "type_code", "line"),
     [
-        (FIRST_OF_LIVE, "B", "#define KCG_LIVE_DUMMY(live) kcg_field(live, 0, KCG_U8) /* 0.1 V; new */"),
-        (LAST_OF_INFO, "h", "#define KCG_INFO_DUMMY(info) kcg_field(info, 32, KCG_I16) /* 0.1 V; new */"),
+        (FIRST_OF_LIVE, "B", f"#define KCG_LIVE_DUMMY(live) kcg_field(live, 0, KCG_U8) {NOTE}"),
+        (LAST_OF_INFO, "h", f"#define KCG_INFO_DUMMY(info) kcg_field(info, 32, KCG_I16) {NOTE}"),
     ],
     ids=["first byte of live data", "signed word of info"],
 )  # fmt: skip

@@ -32,7 +32,7 @@ LIMITS: dict[str, dict[str, float]] = {
         "animated": 2.6,
         "nobody-none": 0.4,
         "but-for": 0.4,
-        "lines over 100 columns": 1,
+        "lines over 100 columns": 0,
         "tokens a code line": 9.2,
         "conditional expressions": 10.5,
         "tuple assignments": 0.5,

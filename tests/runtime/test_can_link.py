@@ -328,9 +328,8 @@ def test_a_bus_that_was_stalled_gets_no_backlog(
     assert [data for can_id, data in sent if can_id == 0x701] in ([], [b"\5"])
     assert boot_ups_and_emergencies(sent) == ["7510"], "the loss of telemetry is reported again"
     said = [message for message in caplog.messages if "no frame can be sent" in message]
-    assert said == [
-        "CAN can0: no frame can be sent. No other node acknowledges, or the bus is full. Trying again."
-    ]
+    reason = "No other node acknowledges, or the bus is full. Trying again."
+    assert said == [f"CAN can0: no frame can be sent. {reason}"]
     assert "CAN can0: frames are sent again, after 4.0 s" in caplog.messages
 
 

@@ -92,7 +92,8 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -
             gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
             sides.append(CanLink(loaded.config.can, gateway, Poller(), FaultLog()))
         sides[0].open(0, wait=True)
-        said = "CAN can0: (messages from 680h on|CANopen node 42|29-bit ids with 2Ah .*): used by another"
+        names = "messages from 680h on|CANopen node 42|29-bit ids with 2Ah .*"
+        said = f"CAN can0: ({names}): used by another"
         with pytest.raises(RunError, match=said):
             sides[1].open(0, wait=True)
         sides[0].close()

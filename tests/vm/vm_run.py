@@ -21,7 +21,7 @@ qemu    An emulated machine, in which Python is 15 times slower. It has the same
 
 In a VM the host's file system is read-only at the same paths, with an empty /tmp, /var/tmp, /run
 and /dev/shm. Each --rw DIR is writable. COMMAND is root, lo is up, the CAN modules are loaded, and
-no vcan interface exists yet. The environment has PATH, HOME, LANG, CI, VIRTUAL_ENV and the variables
+no vcan interface exists yet. The environment has PATH, HOME, LANG, CI, VIRTUAL_ENV and variables
 that begin with KCG_, PYTHON, PYTEST_, HYPOTHESIS_ or COVERAGE_. Python does not find asammdf.
 python-can would import it if it is installed, and numpy and pandas with it, which would take 4 s of
 each process in UML and a minute in QEMU.

@@ -60,7 +60,8 @@ _FORMS = {
     ),
     "excerpt of a DBC": re.compile(r"\"[^\n]*>>!<<[^\n]*"),
     "hexadecimal key": re.compile(
-        r"\b(?:0x)?[0-9A-Fa-f]{32,}\b|\b(?:0x)?[0-9A-Fa-f]{2}(?:[ ,:-]+(?:0x)?[0-9A-Fa-f]{2}){15,}\b"
+        r"\b(?:0x)?[0-9A-Fa-f]{32,}\b"
+        r"|\b(?:0x)?[0-9A-Fa-f]{2}(?:[ ,:-]+(?:0x)?[0-9A-Fa-f]{2}){15,}\b"
     ),
 }
 _SHORT = 8
