@@ -2,8 +2,8 @@
 
 Eva follows all runs of any_calls.c at once: any bytes, times, settings and order of calls, within
 the preconditions of core.h, with the tables of the shipped DBC. An alarm is a place where Eva
-cannot exclude undefined behaviour. alarms.toml lists each alarm with the reason why it is none. A
-new alarm fails the test, and so does a listed one that has gone.
+cannot exclude undefined behaviour. alarms.toml lists each alarm with the reason why it is false. A
+new alarm fails the test. An alarm in the list that Eva no longer reports fails it, too.
 
 A step of `make release`: python -m pytest -s tests/proofs/long_eva.py
 """
@@ -47,7 +47,7 @@ def find_alarms(folder: Path) -> set[str]:
 
 
 def read_alarms(report: Path) -> set[str]:
-    """Return the alarms of a report. The rows about headers repeat those of their callers."""
+    """Return the alarms of a report. The rows about headers repeat the rows of their callers."""
     found = set()
     with report.open(newline="") as file:
         for row in csv.DictReader(file, delimiter="\t"):
@@ -59,7 +59,7 @@ def read_alarms(report: Path) -> set[str]:
 
 
 def _without_numbers(text: str) -> str:
-    """Remove the numbers that Frama-C gives to variables of its own."""
+    """Remove the numbers that Frama-C adds to the names of variables."""
     return re.sub(r"\b(tmp|now|frames)_\d+\b", r"\1", text)
 
 

@@ -13,7 +13,7 @@ class Scale:
 
     prefix: str
     lengths: tuple[tuple[int, int], tuple[int, int]]
-    """Lengths in symbols: live legacy and live V4, then info legacy and info V4."""
+    """Lengths in symbols: the two live forms (legacy, V4), then the two info forms."""
     covered: tuple[tuple[int, int], tuple[int, int]]
     """Symbols that the check covers. As on the wire, it leaves out the end of legacy bodies."""
     crc_factor: int
@@ -21,7 +21,7 @@ class Scale:
 
     @property
     def alphabet(self) -> str:
-        """All symbols that the search for frames can tell apart, and one other."""
+        """All symbols that the search for frames distinguishes, and one other."""
         return f"{self.prefix}LIx"
 
     @property
@@ -72,6 +72,6 @@ SCALES = (
     Scale("K", ((4, 5), (5, 6)), ((2, 4), (3, 5)), crc_factor=3),
     Scale("KO", ((5, 6), (6, 7)), ((3, 5), (4, 6)), crc_factor=2),
 )
-"""Prefixes of one symbol and of two, in which a header can be cut in more ways."""
+"""Prefixes with one symbol and with two, in which a header can be cut in more ways."""
 WHOLE_PREFIX = Scale("KOD", ((6, 7), (7, 8)), ((4, 6), (5, 7)), crc_factor=5)
 """The prefix of the wire. Its six symbols make too many streams for `make prove`."""
