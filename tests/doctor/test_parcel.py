@@ -175,7 +175,7 @@ def test_an_existing_file_is_kept_without_force(setup: Path) -> None:
     path = written(setup.parent / "mine.zip", "x")
     assert "exists" in refused(2, "doctor", "-c", setup, "--parcel", path)
     assert path.read_text() == "x"
-    assert "would write over" in refused(2, "doctor", "-c", setup, "--parcel", setup, "--force")
+    assert "would overwrite" in refused(2, "doctor", "-c", setup, "--parcel", setup, "--force")
     assert "cannot be shown" in refused(2, "doctor", "-c", setup, "--parcel", "-")
 
 
@@ -193,7 +193,7 @@ def test_an_existing_file_is_kept_without_force(setup: Path) -> None:
         (lambda file: file.write_bytes(b"\xff\xfe\0"), "is not a text file"),
         (lambda file: shutil.rmtree(file.parent / "captures"), "captures: "),
         (lambda file: (file.parent / "pass.txt").unlink(), "doctor.txt"),
-        (lambda file: (file.parent / "node.eds").write_text("x"), "is no EDS"),
+        (lambda file: (file.parent / "node.eds").write_text("x"), "is not an EDS"),
     ],
 )  # fmt: skip
 def test_a_fault_of_a_file_leaves_the_rest_of_the_parcel(

@@ -219,7 +219,7 @@ def sources() -> dict[str, Source]:
     return found
 
 
-OF_THE_GATEWAY = 24
+OF_THE_GATEWAY = 25
 """Signals without a field: alive counters, and values that the gateway counts or knows itself."""
 
 

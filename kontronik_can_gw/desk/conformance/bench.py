@@ -10,7 +10,7 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.conformance.slave import NoAnswer, Slave
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.light_imports import without_asammdf
-from kontronik_can_gw.runtime.can.open_can import check_interface
+from kontronik_can_gw.runtime.can.open_can import open_can
 
 
 @contextmanager
@@ -39,7 +39,7 @@ def slave_on_bus(
         raise UserError(f"{eds}: is not a valid EDS: {error}.") from None
     if 0x1000 not in dictionary:
         raise UserError(f"{eds}: does not have the object 1000h, so it is not an EDS.")
-    check_interface(CanConfig(interface=interface, channel=channel))
+    open_can(CanConfig(interface=interface, channel=channel)).close()  # raises with a remedy
     try:
         bus = can.Bus(interface=interface, channel=channel)
     except Exception as error:  # the drivers raise exceptions of any kind

@@ -120,4 +120,4 @@ def readme(contents: Contents, names: Sequence[str], made_ns: int) -> str:
         removed += [f"  {name}: {number} x {kind}" for kind, number in counts]
     lines += removed or ["  nothing"]
     lines += ["", "Still inside:", _STILL_INSIDE]
-    return contents.cleaner.known("\n".join(lines), README)
+    return contents.cleaner.text("\n".join(lines), README)

@@ -149,11 +149,12 @@ test_eeprom_checksum test_eeprom_size test_eeprom_version
 _COUNTERS = """
 losses crc_errors dropped_bytes live_frames info_frames received_bytes suspect_frames sent_frames
 replaced_frames send_failures received_frames bus_off_count dropped_frames id_conflicts
+can_restarts
 """
 _STATES = """
 link_state 5
 layout 2
-gateway_state 3
+gateway_state 4
 can_state 5
 esc_count 255
 escs_ok 255

@@ -211,7 +211,8 @@ class CanLink:
         self._retry.failed(now)
         self.transmitter.clear()
         self._gateway.set_can_state(CanState.DOWN, now)
-        self._conditions.begin(self.condition, f"{reason} Trying again.", now)
+        sentence = reason if reason.endswith(".") else f"{reason}."  # drivers write no full stop
+        self._conditions.begin(self.condition, f"{sentence} Trying again.", now)
 
     def _lost(self, answer: Sent, now: int) -> None:
         """Close an interface that is down or was removed, and schedule its opening."""

@@ -65,7 +65,7 @@ class InterfaceRestart:
         """Number of restarts since a frame has left the interface."""
 
     def follow(self, outage_since: int | None, now: int) -> None:
-        """Request a restart if it is due. The interface must be up, and not in bus-off.
+        """Request a restart if it is due. The interface must be up.
 
         ``outage_since`` is a time since which no frame has left. None without an outage.
         """
