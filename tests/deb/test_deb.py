@@ -101,7 +101,8 @@ def test_without_a_repository_the_remedy_is_given_in_one_line(
     monkeypatch.setattr(make_deb, "PROJECT", tmp_path)
     if not is_git_installed:
         monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(SystemExit, match=r"^make_deb\.py: git .* SOURCE_DATE_EPOCH=.* make deb$"):
+    expected = r"^make_deb\.py: .*git is missing.* SOURCE_DATE_EPOCH=.* make deb$"
+    with pytest.raises(SystemExit, match=expected):
         make_deb.source_time()
 
 

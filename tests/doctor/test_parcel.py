@@ -190,7 +190,7 @@ def test_an_existing_file_is_kept_without_force(setup: Path) -> None:
         (lambda file: (file.parent / "car.dbc").write_text("BO_ hunter2"), "car.dbc"),
         (lambda file: file.unlink(), "No such file"),
         (lambda file: (file.unlink(), file.mkdir()), "is not a file"),
-        (lambda file: file.write_bytes(b"\xff\xfe\0"), "is not a text file"),
+        (lambda file: file.write_bytes(b"\xff\xfe\0"), "is not a UTF-8 text file"),
         (lambda file: shutil.rmtree(file.parent / "captures"), "captures: "),
         (lambda file: (file.parent / "pass.txt").unlink(), "doctor.txt"),
         (lambda file: (file.parent / "node.eds").write_text("x"), "is not an EDS"),

@@ -33,9 +33,12 @@ def locks_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Give each test its own locks.
 
     Otherwise a test of this file that runs in another process at the same time would be another
-    gateway with the same node.
+    gateway with the same node. Root has another folder than an ordinary user.
     """
-    monkeypatch.setattr(folders, "RUN", tmp_path / "run")
+    folder = tmp_path / "run"
+    folder.mkdir(mode=0o700)
+    monkeypatch.setattr(folders, "RUN", folder)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
 
 
 ACTIVE = LinkFacts(

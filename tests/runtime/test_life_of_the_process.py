@@ -100,7 +100,7 @@ def test_a_service_notifies_ready_and_alive_records_and_notifies_its_end(
             process.wait()
     assert not file.exists()
     logged = errors.read_text()
-    assert "record.can_log: was removed and is ignored. `kontronik-can-gw convert" in logged
+    assert "record.can_log: was removed and is ignored. Use `kontronik-can-gw convert" in logged
     last = logged.splitlines()[-1]
     totals = (
         r"stopped by SIGHUP after [\d.]+ s: (\d+) live frames received, 0 CRC errors, "
