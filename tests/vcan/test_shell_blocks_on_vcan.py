@@ -25,6 +25,7 @@ kontronik-can-gw() {
 }
 mount -t sysfs sys /sys  # shows this network namespace
 mount -t tmpfs run /run  # `status` finds no gateway that another test killed
+unset KONTRONIK_RUN XDG_RUNTIME_DIR
 ip link set lo up
 """
 RUNNING = """
