@@ -13,6 +13,7 @@ import tempfile
 import tomllib
 import zipfile
 from collections.abc import Iterator
+from encodings import cp437  # noqa: F401  a user without rights cannot load it later
 from pathlib import Path
 
 import pytest
