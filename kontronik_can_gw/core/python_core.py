@@ -102,8 +102,14 @@ class PythonCore:
             self.messages.on_gateway_change(now, each_second=True)
 
     def _deadline_of(self, esc: EscStream) -> int:
-        """Return the next deadline of an ESC. In quiet mode no second of its statistics ends."""
-        return esc.expiry() if self.status.is_quiet else esc.next_deadline()
+        """Return the next deadline of an ESC.
+
+        In quiet mode no second of its statistics ends, until live data of any ESC are about to end
+        this mode.
+        """
+        if self.status.is_quiet and not self.status.escs_ok:
+            return esc.expiry()
+        return esc.next_deadline()
 
     def _first_expiry(self) -> int:
         return min([self._deadline_of(esc) for esc in self.escs])
@@ -193,6 +199,8 @@ class PythonCore:
         escs_ok = sum([each.live is not None for each in self.escs])
         if escs_ok != self.status.escs_ok:
             self.status.escs_ok = escs_ok
+            if self.status.is_quiet:
+                self._next_expiry = 0  # see _deadline_of
             if not escs_ok:
                 self.status.heard_ns = max([each.live_ns or 0 for each in self.escs])
             self.messages.on_gateway_change(now)

@@ -416,11 +416,14 @@ static int is_quiet(const kcg *g)
     return g->gateway[KCG_IS_QUIET] != 0;
 }
 
-/* Returns the next deadline of an ESC. In quiet mode no second of its statistics ends. */
+/* Returns the next deadline of an ESC. In quiet mode no second of its statistics ends, until live
+   data of any ESC are about to end this mode. */
 static int64_t esc_deadline(const kcg *g, const kcg_esc *e)
 {
     int64_t expiry = earlier(end_of_live(e), end_of_info(e));
-    return is_quiet(g) ? expiry : earlier(e->window_ns + SECOND, expiry);
+    if (is_quiet(g) && !g->gateway[KCG_ESCS_OK])
+        return expiry;
+    return earlier(e->window_ns + SECOND, expiry);
 }
 
 static int expire_esc(kcg_esc *e, int64_t now)
@@ -1489,6 +1492,8 @@ static void report(kcg *g, int esc, int events, int64_t now)
             ok += g->esc[i].has_live;
         if (ok != g->gateway[KCG_ESCS_OK]) {
             g->gateway[KCG_ESCS_OK] = ok;
+            if (is_quiet(g))
+                g->next_expiry = 0; /* see esc_deadline */
             if (!ok)
                 g->gateway[KCG_HEARD_NS] = last_heard(g);
             kcg_gateway_changed(g, 0, now);

@@ -297,3 +297,15 @@ def test_quiet_mode_begins_again_after_each_silence() -> None:
         bench.until_quiet()
         assert bench.sent[-1][1].data[0] & 15 == GatewayState.QUIET
         assert bench.run(60) == []
+
+
+def test_after_the_end_of_quiet_mode_no_deadline_is_due_at_once() -> None:
+    """Seconds of the statistics passed in quiet mode. They end in the turn that ends the mode."""
+    bench = Bench(loaded())
+    bench.run(20)
+    gateway = bench.gateway
+    assert gateway.status.is_quiet
+    gateway.receive_bytes(0, LIVE, bench.now, bench.now)
+    gateway.advance(bench.now)
+    assert not gateway.status.is_quiet
+    assert gateway.core.next_deadline() > bench.now
