@@ -55,10 +55,9 @@ def test_a_slave_of_another_project_is_judged(vcan: str, tmp_path: Path) -> None
     verdicts = verdicts_in(done.stdout)
     counted = Counter(verdicts.values())
     assert done.returncode == 1
-    assert counted["passed"] > 20, done.stdout
+    assert counted["passed"] > 30, done.stdout
     assert counted["failed"] > 3, done.stdout
-    # it answers NMT and block transfers late on a busy machine, so these verdicts vary
-    for name in ("sdo-segmented-upload", "sdo-toggle-bit", "sdo-no-object"):
+    for name in ("sdo-block-upload", "sdo-segmented-upload", "nmt-start", "pdo-each-third-sync"):
         assert verdicts[name] == "passed", done.stdout
     # its EDS says more than its server does
     for name in ("sdo-too-short", "sdo-no-sub-index-of-a-variable", "pdo-restricted-cob-ids"):

@@ -18,6 +18,8 @@ _SYNC = 0x080
 _HEARTBEAT = 0x700
 _SDO_REQUEST = 0x600
 _SDO_ANSWER = 0x580
+_RESET_S = 0.1
+"""Pause after the reset of a slave that sends no boot-up message."""
 DEVICE_TYPE = 0x1000
 """An object that every slave has and that can be read."""
 
@@ -169,6 +171,9 @@ class Slave:
             frames.append(frame)
             if frame.can_id == self.heartbeat_id and frame.data == b"\0":
                 break
+        else:
+            # its reset may still last, and would undo the effect of later commands
+            frames += self.frames_during(_RESET_S)
         self.nmt(0x80)
         return frames + self.frames_until_answer()
 
