@@ -2,13 +2,17 @@
 
 Nothing here imports the gateway. The rows below are the tables of the sheet ("Telemetrieprotokoll",
 V4): offset, type and unit of each field, and the meaning of bits and numbers. The DBC is read with
-regular expressions. `header` writes both as tables for `every_value.c`.
+regular expressions. The names of states and devices are those of the tests' copy of the sheet.
+`header` writes both as tables for `every_value.c`.
 """
 
 import re
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
+
+from esc.sheet import DEVICES
+from esc.sheet import OPERATING_STATES as STATES
 
 
 @dataclass(frozen=True)
@@ -90,32 +94,6 @@ SELFTEST_ERRORS = (
     *("TestEepromEmpty", "TestEepromStickPositions", "TestEepromChecksum", "TestEepromSize"),
     "TestEepromVersion",
 )
-STATES = {
-    1: "WaitForSignal",
-    2: "WaitForMotorOff",
-    3: "WaitForMotorOn",
-    7: "Selftest",
-    9: "Error_Selftest",
-    10: "CutOffDuringOperation",
-    11: "AcousticSignal",
-    12: "MotorOff",
-    13: "StandBy",
-    14: "Brake",
-    15: "BrakeTargetBackward",
-    16: "BrakeTargetForward",
-    17: "Programming",
-    18: "Sync_Forward",
-    19: "Sync_Backward",
-    20: "Sync_StandBy",
-    21: "Forward",
-    22: "Backward",
-    23: "SpoolUpFromStill",
-    24: "SpoolUpFromTurn",
-    25: "SpoolUpQuick",
-    26: "RPMControl",
-}
-"""Names of operating states. A state without a name is sent as Error."""
-DEVICES = {1: "KOSMIK", 2: "KOLIBRI", 3: "JIVEPro", 4: "KONTROL-X", 5: "UHV"}
 JIVE_PRO = 3
 BEC_CURRENTS = ("BecCurrent", "MaxBecCurrent")
 """The values that a JIVEPro does not supply."""
