@@ -174,7 +174,7 @@ def nmt_no_sdo_while_stopped(slave: Slave) -> str:
     slave.nmt(STOP)
     slave.send_request(b"\x40\x01\x10\x00")
     slave.nmt(ENTER_PRE_OPERATIONAL)
-    answers = [frame for frame in slave.frames_until_answer() if slave.is_answer(frame)]
+    answers = slave.answers_until_answer()
     require(not answers, "it answered")
     return "no answer"
 

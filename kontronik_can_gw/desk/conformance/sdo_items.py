@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from canopen.objectdictionary import ODVariable
 
 TOGGLE = 0x05030000
-TIMED_OUT = 0x05040000
 UNKNOWN_COMMAND = 0x05040001
 UNSUPPORTED_ACCESS = 0x06010000
 WRITE_ONLY = 0x06010001
@@ -216,7 +215,7 @@ def sdo_abort_by_the_client(slave: Slave) -> str:
     index, sub = _segmented(slave)
     unless_aborted(slave.request(b"\x40" + multiplexer(index, sub)))
     slave.send_request(b"\x80" + multiplexer(index, sub) + b"\0\0\0\x08")
-    answers = [frame for frame in slave.frames_until_answer() if slave.is_answer(frame)]
+    answers = slave.answers_until_answer()
     require(not answers, "the abort was answered")
     return "only the upload was answered"
 
@@ -304,7 +303,7 @@ def sdo_short_request(slave: Slave) -> str:
     whole = b"\x40" + multiplexer(0x1001, 0) + bytes(3)
     for size in range(8):
         slave.send(0x600 + slave.node_id, whole[:size])
-    answers = [frame for frame in slave.frames_until_answer() if slave.is_answer(frame)]
+    answers = slave.answers_until_answer()
     good = [frame for frame in answers if frame.data[:1] == b"\x80"]
     require(answers == good, f"{len(answers) - len(good)} were answered like whole requests")
     return f"{len(good)} aborts, {8 - len(good)} ignored, the upload was answered"
@@ -314,6 +313,6 @@ def sdo_short_request(slave: Slave) -> str:
 def sdo_extended_frame_is_ignored(slave: Slave) -> str:
     request = b"\x40" + multiplexer(0x1001, 0) + bytes(4)
     slave.send(0x600 + slave.node_id, request, extended=True)
-    answers = [frame for frame in slave.frames_until_answer() if slave.is_answer(frame)]
+    answers = slave.answers_until_answer()
     require(not answers, "it was answered")
     return "no answer"

@@ -141,6 +141,13 @@ class Slave:
             frames.append(frame)
         raise NoAnswer
 
+    def answers_until_answer(self) -> list[Frame]:
+        """Read the device type and return the SDO answers that arrived before its answer.
+
+        Raises NoAnswer after the time limit.
+        """
+        return [frame for frame in self.frames_until_answer() if self.is_answer(frame)]
+
     # --- NMT and SYNC
 
     @property

@@ -12,6 +12,8 @@ from typing import IO
 from kontronik_can_gw import __version__
 from kontronik_can_gw.desk.parcel.parts import Contents, Part
 from kontronik_can_gw.runtime.files.disk import write_all
+from kontronik_can_gw.runtime.status.facts import utc
+from kontronik_can_gw.times import SECOND
 
 README = "README.txt"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -83,7 +85,7 @@ def write_archive(file: IO[bytes], contents: Contents, made_ns: int) -> None:
 
 
 def _write(raw: _File, parts: Sequence[Part], contents: Contents, made_ns: int) -> None:
-    date = time.gmtime(made_ns // 1_000_000_000)[:6]
+    date = time.gmtime(made_ns // SECOND)[:6]
     with zipfile.ZipFile(raw, "w") as archive:  # type: ignore[call-overload]
         for part in parts:
             is_packed = part.name.startswith("captures/")
@@ -106,7 +108,7 @@ def _info(name: str, date: tuple[int, ...], kind: int) -> zipfile.ZipInfo:
 
 def readme(contents: Contents, names: Sequence[str], made_ns: int) -> str:
     """Return the text of README.txt: the parts, missing parts, and removed secrets."""
-    made = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(made_ns // 1_000_000_000))
+    made = utc(made_ns / SECOND)
     lines = [f"Support parcel of kontronik-can-gw {__version__}, made {made}", "", "Files:"]
     lines += [f"  {name}" for name in names]
     lines += ["", "Meaning:"]
