@@ -279,10 +279,10 @@ def conflict(
     """
     gateway = bench.gateway
     node = 1 + n
-    if any("somebody else" in text and f"node {node}" in text for text in gateway.lines):
+    if any("another device" in text and f"node {node}" in text for text in gateway.lines):
         # The earlier conflict has to end first. Otherwise this is the same condition.
-        begun = gateway.log.count("somebody else")
-        bench.wait_until(lambda: gateway.log.count("nobody else") >= begun, 15, "it is over")
+        begun = gateway.log.count("another device")
+        bench.wait_until(lambda: gateway.log.count("no other device") >= begun, 15, "it is over")
     lines = len(gateway.lines)
     with RawBus(bench.watched) as vandal:
         for _ in range(50):
@@ -290,7 +290,7 @@ def conflict(
                 vandal.send(can_id + node, bytes.fromhex(data))
             time.sleep(0.01)
     injection.wait_emergency(node, CONFLICT)
-    bench.wait_log("somebody else", lines)
+    bench.wait_log("another device", lines)
     said = len(gateway.lines) - lines
     bench.expect(1 <= said <= 2 * len(frames), f"{said} lines in the log for one condition")
     still_answers(bench)
