@@ -11,7 +11,14 @@ from pathlib import Path
 from posixpath import normpath
 from typing import Any, cast
 
-from kontronik_can_gw.config.keys import REMOVED_KEYS, TABLES, Config, EscConfig, required
+from kontronik_can_gw.config.keys import (
+    REMOVED_KEYS,
+    TABLES,
+    CanConfig,
+    Config,
+    EscConfig,
+    required,
+)
 from kontronik_can_gw.core.output_setup import OUTPUTS
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.value_names import VALUES_BY_KEY, normalize
@@ -97,7 +104,8 @@ def _make_config(
             escs[number] = esc
     config = None
     if not problems:
-        warnings = tuple(f"{file}: {text}" for text in removed)
+        texts = [*removed, *_without_effect(made["can"])]
+        warnings = tuple(f"{file}: {text}" for text in texts)
         config = Config(
             **cast(Any, made),
             esc=tuple(escs.values()),
@@ -194,6 +202,15 @@ def _is_ambiguous(name: str, starts: set[str]) -> bool:
         for rest in filter(None, rests)
         for value in VALUES_BY_KEY
     )
+
+
+def _without_effect(can: CanConfig) -> Iterator[str]:
+    """Yield a line for each key of [can] that has no effect with its interface."""
+    if can.restart_after_s and can.interface != "socketcan":
+        yield (
+            f"can.restart_after_s: has no effect with the interface {can.interface}, because only "
+            "SocketCAN interfaces can be restarted"
+        )
 
 
 def _output_problems(config: Config) -> Iterator[str]:

@@ -419,3 +419,28 @@ def test_any_content_of_a_file_raises_at_most_a_user_error(
     file.write_bytes(content)
     with pytest.raises(UserError):
         load(file)
+
+
+# --- keys without effect
+
+
+@pytest.mark.parametrize(
+    ("can", "warnings"),
+    [
+        ({"interface": "socketcan", "restart_after_s": 0.5}, ()),
+        ({"interface": "slcan", "restart_after_s": 0}, ()),
+        (
+            {"interface": "slcan", "restart_after_s": 0.5},
+            (
+                "a.toml: can.restart_after_s: has no effect with the interface slcan, because "
+                "only SocketCAN interfaces can be restarted",
+            ),
+        ),
+    ],
+)
+def test_restart_of_an_interface_that_cannot_be_restarted_is_a_warning(
+    can: dict[str, Any],
+    warnings: tuple[str, ...],
+) -> None:
+    config = parse({"can": can} | escs({}), "a.toml")
+    assert config.warnings == warnings
