@@ -16,13 +16,16 @@ from typing import NamedTuple
 import beds
 from beds import BUS, fault
 from bus_watch import SECOND
-from can_faults import near
+from can_faults import near, still_answers
 from harness import Bench, Injection
+from raw_bus import RawBus
 from restart_unit import RestartUnit
 
 RESTART_AFTER_S = 0.5
 CALM_S = 70
 """After this time without a fault, the log does not summarise further ones."""
+QUIET_AFTER_S = 2
+JAMMED_S = 30
 RATE_HZ = 10
 """Frames of the ESC in a second: few, because an outage may last ten minutes."""
 SHORTEST_S = 1
@@ -213,3 +216,42 @@ def stays_dead(bench: Bench, injection: Injection, seconds: float) -> None:
         bench.expect(reports == 1, f"{reports} lines with {text!r}")
     count_of = UNITS[0].starts - restarts
     bench.expect(8 <= count_of <= 16, f"{count_of} restarts")
+
+
+def parked_with_adapters(_: Path) -> contextlib.AbstractContextManager[Bench]:
+    return beds.adapters_with(RATE_HZ, can=f"quiet_after_s = {QUIET_AFTER_S}\n")
+
+
+@fault(
+    "Outage",
+    "the bus is jammed as quiet mode begins",
+    RECOVERY_S,
+    bed=parked_with_adapters,
+    settle_s=1,
+    rounds=(QUIET_AFTER_S - 1, QUIET_AFTER_S - 0.1, QUIET_AFTER_S + 0.1),
+)
+def jammed_as_quiet_begins(bench: Bench, injection: Injection, seconds: float) -> None:
+    """The frames that the controller holds may leave late. After them, the gateway is silent."""
+    watch = bench.watch
+    before = watch.by_more
+    watch.more_ns = (JAMMED_S + 60) * SECOND
+    lines = len(bench.gateway.lines)
+    bench.escs[0].on = False
+    time.sleep(seconds)
+    BUS[0].is_jammed = True
+    bench.wait_log("quiet: no ESC was heard", lines)
+    time.sleep(JAMMED_S)
+    BUS[0].is_jammed = False
+    with RawBus(bench.watched) as far:
+        while far.receive(0.5):
+            pass
+        found = far.receive(CALM_S)
+        bench.expect(found is None, f"{found} was sent in quiet mode")
+    still_answers(bench)
+    watch.catch_up()
+    late = watch.by_more - before
+    watch.more_ns = 0
+    bench.expect(late <= HELD, f"{late} old values")
+    injection.cleared()
+    bench.escs[0].on = True
+    injection.wait_recovery()
