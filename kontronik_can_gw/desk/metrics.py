@@ -127,7 +127,8 @@ def _samples(document: Document, age_s: float) -> Iterator[Sample]:
         yield "can_transmit_errors", transmit, {}
         yield "can_receive_errors", receive, {}
     for key, count in can["counters"].items():
-        yield f"can_{key.removesuffix('_count')}_total", count, {}
+        name = key.removeprefix("can_").removesuffix("_count")
+        yield f"can_{name}_total", count, {}
     yield from _clock(document.get("clock") or {})
     for esc in document["escs"]:
         yield from _esc(esc, document["units"])
