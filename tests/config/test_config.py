@@ -423,19 +423,18 @@ def test_any_content_of_a_file_raises_at_most_a_user_error(
 
 # --- keys without effect
 
+NO_RESTART = (
+    "a.toml: can.restart_after_s: has no effect with the interface slcan, because only SocketCAN "
+    "interfaces can be restarted"
+)
+
 
 @pytest.mark.parametrize(
     ("can", "warnings"),
     [
         ({"interface": "socketcan", "restart_after_s": 0.5}, ()),
         ({"interface": "slcan", "restart_after_s": 0}, ()),
-        (
-            {"interface": "slcan", "restart_after_s": 0.5},
-            (
-                "a.toml: can.restart_after_s: has no effect with the interface slcan, because "
-                "only SocketCAN interfaces can be restarted",
-            ),
-        ),
+        ({"interface": "slcan", "restart_after_s": 0.5}, (NO_RESTART,)),
     ],
 )
 def test_restart_of_an_interface_that_cannot_be_restarted_is_a_warning(
