@@ -112,4 +112,5 @@ def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> s
             say(f"warning: {line}")
     version = re.sub(" ?layout [0-9A-F]{8}$", "", plain.version or "")
     copies = copies_of(plain, layout.file, escs, settings)
-    return copies_text(plain, copies, f"{version} layout {layout.fingerprint}".strip())
+    version = f"{version} layout {layout.fingerprint}".strip()
+    return copies_text(plain, copies, version, layout.data_ids)

@@ -6,7 +6,7 @@ signal. Case and underscores in their names do not matter.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc import names
@@ -80,6 +80,19 @@ def data_ids_of(message: "Message", database: "Database") -> tuple[int, ...] | N
     if rest or not numbers:
         raise UnclearAttribute(f"{name} is {text[:80]!r}, which is no list of numbers.")
     return tuple(int(number, 16 if number[:2] in ("0x", "0X") else 10) for number in numbers)
+
+
+def with_data_ids(attributes: Mapping[str, object], data_ids: Sequence[int]) -> dict[str, object]:
+    """Return attributes of a message or signal with other data ids, if they contain data ids.
+
+    Numbers stay numbers, and texts become decimal lists.
+    """
+    changed = dict(attributes)
+    for name, value in attributes.items():
+        if normalize(name) in _DATA_IDS:
+            is_number = isinstance(value, (int, float)) and len(data_ids) == 1
+            changed[name] = data_ids[0] if is_number else ", ".join(map(str, data_ids))
+    return changed
 
 
 def protected_bits_of(message: "Message", database: "Database") -> int | None:

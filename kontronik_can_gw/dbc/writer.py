@@ -8,9 +8,11 @@ comments and text attributes.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc.copies import Copy
+from kontronik_can_gw.dbc.e2e_attributes import with_data_ids
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Signal
@@ -74,15 +76,18 @@ def copies_text(
     database: "Database",
     copies: Sequence[Copy] | None = None,
     version: str | None = None,
+    data_ids: Mapping[int, Sequence[int]] = MappingProxyType({}),
 ) -> str:
     """Return a database as text.
 
     ``copies``: its messages as they are sent. None: the messages of the database unchanged.
+    ``data_ids``: E2E data ids with which messages are sent, by ``Copy.key``. They replace those of
+    the attributes, because the copies of a message for several ESCs have data ids of their own.
     """
     if copies is None:
         copies = [Copy(message) for message in database.messages]
     relations = [*_relations(database, copies)]
-    messages = [_message(copy) for copy in copies]
+    messages = [_message(copy, data_ids.get(copy.key)) for copy in copies]
     return dbc_text(database, messages, version, relations)
 
 
@@ -168,7 +173,7 @@ def _details(messages: Sequence[MessageRow]) -> tuple[list[str], ...]:
 # --- rows of a database
 
 
-def _message(sent: Copy) -> MessageRow:
+def _message(sent: Copy, data_ids: Sequence[int] | None = None) -> MessageRow:
     message = sent.message
     multiplexers = sum(signal.is_multiplexer for signal in message.signals)
     pages = [len(signal.multiplexer_ids or ()) for signal in message.signals]
@@ -180,13 +185,18 @@ def _message(sent: Copy) -> MessageRow:
     for group in message.signal_groups or ():
         names = " ".join(sent.prefix + name for name in group.signal_names)
         groups.append(f"{group.name} {group.repetitions} : {names}")
+    attributes = _own_attributes(message)
+    if data_ids is not None:
+        attributes = with_data_ids(attributes, data_ids)
+        for row in signals:
+            row.attributes = with_data_ids(row.attributes, data_ids)
     return MessageRow(
         key=sent.key,
         name=sent.name,
         length=message.length,
         senders=message.senders,
         comment=message.comment,
-        attributes=_own_attributes(message),
+        attributes=attributes,
         signals=signals,
         groups=groups,
     )

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from zlib import crc32
 
 from kontronik_can_gw.esc.values import Group, Value
+from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals.e2e import Protection
 
 
@@ -219,6 +220,16 @@ class Layout:
     """Node of the DBC whose messages the gateway sends."""
     messages: tuple[MessagePlan, ...]
     warnings: tuple[str, ...] = ()
+
+    @property
+    def data_ids(self) -> dict[int, tuple[int, ...]]:
+        """The data ids of protected messages, by id. The id has EXTENDED for 29 bits."""
+        found = {}
+        for message in self.messages:
+            if message.e2e is not None:
+                can_id = message.can_id | (EXTENDED if message.extended else 0)
+                found[can_id] = message.e2e.data_ids
+        return found
 
     @cached_property
     def fingerprint(self) -> str:

@@ -17,10 +17,14 @@ from dbc_bench import compiled, refused
 from e2e import p01, p02, p05, p11
 from hypothesis import given
 from hypothesis import strategies as st
-from packer_oracle import Msg, Sig, dbc_text, get
+from packer_oracle import Msg, Sig, dbc_text, get, read
 
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.dbc import e2e_attributes
+from kontronik_can_gw.dbc.expand import copies_of
+from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.writer import copies_text
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -554,6 +558,35 @@ def test_a_data_id_of_the_dbc_is_not_used_for_copies_for_several_escs() -> None:
     assert [plan.e2e for plan in layout.messages] == [protection("5", 1), protection("5", 2)]
     both = compiled(text, ("left", "right"), e2e={"M": "5"}, e2e_data_ids=ids)
     assert [plan.e2e for plan in both.messages] == [protection("5", 1), protection("5", 2)]
+
+
+@pytest.mark.parametrize("owner", ["BO_ 291", "SG_ 291 M_CRC"])
+@pytest.mark.parametrize(
+    ("name", "stated", "ids"),
+    [
+        ("5", 0x123, (1, 2)),
+        ("5", "0x123", (1, 2)),
+        ("2", LIST, (IDS_OF_2, FIRST_16)),
+    ],
+)
+def test_a_dbc_for_several_escs_states_the_data_ids_that_are_sent(
+    name: str,
+    stated: object,
+    ids: tuple[Any, Any],
+    owner: str,
+) -> None:
+    value = Sig("BatteryVoltage", 32, 16, unit="V")
+    text = layout_text(name, value=value) + attributes(f"P0{name}", stated, owner)
+    settings = DbcConfig(e2e_data_ids=dict(zip(("LeftM", "RightM"), ids, strict=True)))
+    plain = read(text)
+    escs = [EscSettings("left"), EscSettings("right")]
+    layout = prepare(plain, "my.dbc", escs, settings)
+    written = read(
+        copies_text(plain, copies_of(plain, "my.dbc", escs, settings), data_ids=layout.data_ids)
+    )
+    found = [e2e_attributes.data_ids_of(message, written) for message in written.messages]
+    assert found == [plan.e2e.data_ids for plan in layout.messages if plan.e2e]
+    assert found == [each if isinstance(each, tuple) else (each,) for each in ids]
 
 
 FUNCTIONS = {
