@@ -12,7 +12,7 @@ help:
 	@echo 'make prove     the proofs of docs/proof.md that end within 5 min; a part of make test-all'
 	@echo 'make release   tests that take hours, on a quiet machine: faults on emulated hardware,'
 	@echo '               random faults, a recorded hour'
-	@echo '               (ARGS="--only qemu|outages|soak|hour|put-in|machines|fuzz|proofs|wheels|deb")'
+	@echo '               (ARGS="--only qemu|outages|soak|hours|hour|put-in|machines|fuzz|proofs|wheels|deb")'
 	@echo 'make soak      random faults for ten minutes   (ARGS="--minutes 60 --seed 1")'
 	@echo 'make hour      convert a recorded hour to every format, read it back and compare'
 	@echo '               (ARGS="--minutes 6")'

@@ -21,6 +21,7 @@ prove, the same step alone
 release, by hand on a quiet machine:
   qemu      the fault programme on emulated hardware
   soak      random faults
+  hours     30 hours of virtual time without a fault
   hour      a recorded hour
   put-in    a list of faults that the tests must detect
   machines  the exported core on other machines
@@ -86,6 +87,7 @@ STEPS = {
     "qemu": FAULTS.format("qemu"),
     "outages": FAULTS.format("uml") + " --only=Outage: --outages=20 --hangs=50",
     "soak": FAULTS.format("soak") + " --minutes=240",
+    "hours": FAULTS.format("hours") + " --hours=30",
     "hour": "python tests/hour/hour_programme.py",
     "put-in": "python tests/mutants/put_in_faults.py",
     "wheels": "python tests/native/wheels.py {scratch}",
@@ -100,7 +102,7 @@ TIERS = {
     "prove": (("prove",),),
     "release": (
         (
-            *("qemu", "outages", "soak", "hour", "put-in"),
+            *("qemu", "outages", "soak", "hours", "hour", "put-in"),
             *("machines", "fuzz", "proofs", "wheels", "deb"),
         ),
     ),
@@ -123,6 +125,7 @@ NEEDS = {
     "faults": ("linux.uml cc", ENABLE_UML),
     "outages": ("linux.uml cc", ENABLE_UML),
     "soak": ("linux.uml cc", ENABLE_UML),
+    "hours": ("linux.uml cc", ENABLE_UML),
     "qemu": ("qemu-system-x86_64", "sudo tests/vm/setup.sh qemu"),
     "wheels": (WHEELS, f"sudo apt-get install {ENABLE_WHEELS}"),
     "machines": (
