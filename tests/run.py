@@ -27,6 +27,7 @@ release, by hand on a quiet machine:
   machines  the exported core on other machines
   fuzz      the C core under fuzzers, ten minutes each
   proofs    the proofs that need longer
+  years     ten years of virtual time through the core in C (-- --years 0.1)
   wheels    wheels for other machines
   deb       the Debian packages in fresh roots of both releases
 
@@ -94,6 +95,7 @@ STEPS = {
     "machines": f"{PYTEST} -s tests/native/on_machines.py",
     "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} {FUZZ_OPTIONS} tests/native/test_fuzz.py",
     "proofs": (f"{PYTEST} -s {PROOF_OPTIONS} tests/proofs/long_*.py tests/proofs/real_dbcs.py"),
+    "years": "python tests/proofs/years.py {args}",
     "deb": f"{PYTEST} -o faulthandler_timeout=900 tests/deb/in_fresh_roots.py",
 }
 TIERS = {
@@ -103,7 +105,7 @@ TIERS = {
     "release": (
         (
             *("qemu", "outages", "soak", "hours", "hour", "put-in"),
-            *("machines", "fuzz", "proofs", "wheels", "deb"),
+            *("machines", "fuzz", "proofs", "years", "wheels", "deb"),
         ),
     ),
 }
