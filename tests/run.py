@@ -21,11 +21,13 @@ prove, the same step alone
 release, by hand on a quiet machine:
   qemu      the fault programme on emulated hardware
   soak      random faults
+  hours     30 hours of virtual time without a fault
   hour      a recorded hour
   put-in    a list of faults that the tests must detect
   machines  the exported core on other machines
   fuzz      the C core under fuzzers, ten minutes each
   proofs    the proofs that need longer
+  years     ten years of virtual time through the core in C (-- --years 0.1)
   wheels    wheels for other machines
   deb       the Debian packages in fresh roots of both releases
 
@@ -86,12 +88,14 @@ STEPS = {
     "qemu": FAULTS.format("qemu"),
     "outages": FAULTS.format("uml") + " --only=Outage: --outages=20 --hangs=50",
     "soak": FAULTS.format("soak") + " --minutes=240",
+    "hours": FAULTS.format("hours") + " --hours=30",
     "hour": "python tests/hour/hour_programme.py",
     "put-in": "python tests/mutants/put_in_faults.py",
     "wheels": "python tests/native/wheels.py {scratch}",
     "machines": f"{PYTEST} -s tests/native/on_machines.py",
     "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} {FUZZ_OPTIONS} tests/native/test_fuzz.py",
     "proofs": (f"{PYTEST} -s {PROOF_OPTIONS} tests/proofs/long_*.py tests/proofs/real_dbcs.py"),
+    "years": "python tests/proofs/years.py {args}",
     "deb": f"{PYTEST} -o faulthandler_timeout=900 tests/deb/in_fresh_roots.py",
 }
 TIERS = {
@@ -100,8 +104,8 @@ TIERS = {
     "prove": (("prove",),),
     "release": (
         (
-            *("qemu", "outages", "soak", "hour", "put-in"),
-            *("machines", "fuzz", "proofs", "wheels", "deb"),
+            *("qemu", "outages", "soak", "hours", "hour", "put-in"),
+            *("machines", "fuzz", "proofs", "years", "wheels", "deb"),
         ),
     ),
 }
@@ -123,6 +127,7 @@ NEEDS = {
     "faults": ("linux.uml cc", ENABLE_UML),
     "outages": ("linux.uml cc", ENABLE_UML),
     "soak": ("linux.uml cc", ENABLE_UML),
+    "hours": ("linux.uml cc", ENABLE_UML),
     "qemu": ("qemu-system-x86_64", "sudo tests/vm/setup.sh qemu"),
     "wheels": (WHEELS, f"sudo apt-get install {ENABLE_WHEELS}"),
     "machines": (

@@ -5,10 +5,10 @@ from typing import Any
 
 from kontronik_can_gw.capture.format import COUNTERS
 from kontronik_can_gw.core.header_parts import whole_number
-from kontronik_can_gw.esc.telemetry import MAX_COUNT
+from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY
 from kontronik_can_gw.times import END_OF_TIME, SECOND
 
-_MAX_MW_NS = MAX_COUNT * SECOND
+_MAX_MW_NS = MAX_ENERGY * SECOND
 
 
 def check_time(time_ns: int) -> None:

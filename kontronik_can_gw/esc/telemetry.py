@@ -19,7 +19,9 @@ INFO_TIMEOUT_NS = 10 * SECOND
 An ESC sends an info frame every second, or every five seconds if it sends at 20 Hz.
 """
 MAX_COUNT = 1 << 48
-"""Limit of a counter, and of an energy in mW s. At 1 Mbit/s it takes more than a human life."""
+"""Limit of a counter. At 1 Mbit/s it takes more than a human life."""
+MAX_ENERGY = 1 << 55
+"""Limit of an energy in mW s. At 100 kW it takes more than ten years."""
 
 
 class LinkState(IntEnum):

@@ -11,7 +11,7 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
-from kontronik_can_gw.esc.telemetry import MAX_COUNT
+from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY
 from kontronik_can_gw.esc.values import Divisor, Kind, Value
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import MAX_GEAR, MAX_POLES, NotInCore
@@ -88,7 +88,9 @@ def _range(row: Any, value: Value) -> tuple[int, int]:
         return low, value.high
     if value.kind is Kind.RUN_TIME:
         return low, END_OF_TIME  # in ns
-    return low, MAX_COUNT  # in mW s, ms or frames
+    if value.kind is Kind.INTEGRAL:
+        return low, MAX_ENERGY  # in mW s
+    return low, MAX_COUNT  # in ms or frames
 
 
 def _set_integer_scale(row: Any, signal: SignalPlan, value: Value) -> None:

@@ -15,7 +15,7 @@ from kontronik_can_gw.capture.limits import check_state
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.esc.telemetry import MAX_COUNT
+from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY
 from kontronik_can_gw.times import END_OF_TIME
 
 GOOD = {
@@ -32,7 +32,7 @@ def _with(name: str, number: int) -> dict[str, Any]:
 
 
 LIMITS = {
-    "energy": MAX_COUNT * 10**9,
+    "energy": MAX_ENERGY * 10**9,
     "run_time": END_OF_TIME - 1,
     "losses": MAX_COUNT - 1,
     "started_ns": END_OF_TIME - 1,

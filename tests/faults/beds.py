@@ -73,11 +73,14 @@ def two(_: Path) -> contextlib.AbstractContextManager[Bench]:
     return bench_of(prefix=WITHOUT_OVERRIDE)
 
 
-def everything(folder: Path) -> contextlib.AbstractContextManager[Bench]:
-    """Return the bench of ``two`` with recording and DroneCAN."""
+def everything(
+    folder: Path,
+    identities: Sequence[Identity] = IDENTITIES,
+) -> contextlib.AbstractContextManager[Bench]:
+    """Return the bench of ``two``, or of other ESCs, with recording and DroneCAN."""
     record = f'[record]\ndirectory = "{folder / "captures"}"\nkeep_mb = 20\nmin_free_mb = 1\n'
     dronecan = "[dronecan]\nenabled = true\nnode_id = 100\n"
-    return bench_of(prefix=WITHOUT_OVERRIDE, more=record + dronecan)
+    return bench_of(identities, prefix=WITHOUT_OVERRIDE, more=record + dronecan)
 
 
 def parked(_: Path) -> contextlib.AbstractContextManager[Bench]:

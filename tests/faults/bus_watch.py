@@ -278,6 +278,9 @@ class BusWatch(Judge):
         self.interface = interface
         self.failure: BaseException | None = None
         self._ignore_local = ignore_local
+        self._open()
+
+    def _open(self) -> None:
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         for option in (SO_RCVBUFFORCE, socket.SO_RCVBUF):
             with contextlib.suppress(OSError):
@@ -291,6 +294,16 @@ class BusWatch(Judge):
     def start(self) -> Self:
         self._thread.start()
         return self
+
+    def pause(self) -> None:
+        """Judge no frames until ``resume``."""
+        self.close()
+
+    def resume(self) -> None:
+        """Judge frames again. Does nothing if the judge is not paused."""
+        if self._closed:
+            self._open()
+            self._thread.start()
 
     def _run(self) -> None:
         try:

@@ -1,11 +1,12 @@
 """The fault programme: injects faults into a running gateway in a virtual machine.
 
-    python tests/faults/programme.py [uml|qemu|soak] [--only TEXT]... [--minutes N] [--seed N]
-                                     [--junit FILE] [--page]
+    python tests/faults/programme.py [uml|qemu|soak|hours] [--only TEXT]... [--minutes N]
+                                     [--hours N] [--seed N] [--junit FILE] [--page]
 
 uml     faults that need only a kernel with vxcan, slcan and vcan, in User Mode Linux
 qemu    faults of real drivers, on emulated hardware (tests/vm/setup.sh qemu)
 soak    random faults of uml for minutes or hours, in the same order for the same seed
+hours   no faults: one ESC for hours of virtual time (--hours), see long_run.py
 
 Faults set the clock, mount file systems and create interfaces, but never on the machine itself. The
 exit code is 1 if the gateway did not recover in time, a value on the bus was wrong or lost without
@@ -26,6 +27,7 @@ from pathlib import Path
 
 import beds
 import can_faults  # noqa: F401  registers its faults, as the others do
+import long_run
 import outage_faults
 import process_faults  # noqa: F401
 import qemu_faults  # noqa: F401
@@ -37,10 +39,15 @@ from memory_slope import Sample, faults_in, slope_kib_per_hour
 PROJECT = Path(__file__).resolve().parents[2]
 REPORT = "report.json"
 TIMEOUT_S = {"uml": 2300, "qemu": 600}
+MIN_HOURS = 0.1
+MAX_HOURS = 1000.0
+REAL_S_PER_HOUR = 3600
+"""Longest real time of an hour of virtual time."""
 NEW_PROCESS = ("missing at start", "kill -9", "SIGTERM", "frozen")
 """Faults that end the gateway, so that its memory could not be followed."""
 MAX_GROWTH_KIB = 2048
 SOAK = Fault("Process", "memory, descriptors and threads after it all", None, print, beds.two)
+HOURS = Fault("Process", "hours without a fault, past the year 2038", None, print, beds.two)
 
 
 # --- outside of the virtual machine
@@ -51,6 +58,8 @@ def run_inside(args: argparse.Namespace) -> Report:
     with tempfile.TemporaryDirectory(prefix="kcg-faults.") as folder:
         timeout_s = TIMEOUT_S.get(args.part, 180 * args.minutes + 300)
         timeout_s *= max(1, args.outages // 4)
+        if args.part == "hours":
+            timeout_s = REAL_S_PER_HOUR * args.hours + 300
         words = [
             sys.executable,
             PROJECT / "tests/vm/vm_run.py",
@@ -65,6 +74,7 @@ def run_inside(args: argparse.Namespace) -> Report:
             f"--inside={folder}",
             f"--seed={args.seed}",
             f"--minutes={args.minutes:g}",
+            f"--hours={args.hours:g}",
             f"--outages={args.outages}",
             f"--hangs={args.hangs}",
             *(f"--only={text}" for text in args.only),
@@ -160,19 +170,22 @@ def main() -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("part", nargs="?", choices=("uml", "qemu", "soak"), default="uml")
+    parser.add_argument("part", nargs="?", choices=("uml", "qemu", "soak", "hours"), default="uml")
     parser.add_argument("--junit", type=Path, help="write what came of it as a JUnit report")
     parser.add_argument("--page", action="store_true", help="write it to docs/fault-programme.md")
     parser.add_argument("--only", action="append", default=[], help="faults with this text")
     parser.add_argument("--minutes", type=float, default=10)
+    parser.add_argument("--hours", type=float, default=30, help="virtual time of hours")
     parser.add_argument("--outages", type=int, default=2, help="number of lengths of outages")
     parser.add_argument("--hangs", type=int, default=4, help="number of hanging adapters")
     parser.add_argument("--seed", type=int, default=random.SystemRandom().randrange(1 << 32))
     parser.add_argument("--inside", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if not MIN_HOURS <= args.hours <= MAX_HOURS:
+        parser.error(f"--hours is {MIN_HOURS:g} to {MAX_HOURS:g}")
     outage_faults.choose(args.outages, args.hangs)
-    if args.part == "soak":
-        faults = [SOAK]
+    if args.part in ("soak", "hours"):
+        faults = [SOAK if args.part == "soak" else HOURS]
     else:
         faults = [fault for fault in in_order() if fault.machine.lower() == args.part]
         if args.only:
@@ -191,6 +204,11 @@ def main() -> int:
         print(f"seed {args.seed}", flush=True)
         with beds.everything(args.inside) as bench:
             soak(bench, report, random.Random(args.seed), time.monotonic() + 60 * args.minutes)
+        report.write(args.inside / REPORT)
+    elif args.part == "hours":
+        long_run.set_wall_clock(args.hours)
+        with beds.everything(args.inside, beds.IDENTITIES[:1]) as bench:
+            long_run.live(bench, HOURS, report, args.hours, MAX_GROWTH_KIB)
         report.write(args.inside / REPORT)
     else:
         run(faults, report, args.inside)

@@ -13,7 +13,13 @@ from built import STRICT, built, run_sanitized
 from dbc_bench import compiled
 from packer_oracle import Msg, Sig, dbc_text
 
+from kontronik_can_gw.canopen.bound_values import compile_pdo
+from kontronik_can_gw.canopen.dictionary import Variable
+from kontronik_can_gw.canopen.eds import load as load_eds
+from kontronik_can_gw.canopen.objects import BINDINGS
+from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.slots import SlotPlan, SlotSettings
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -23,7 +29,7 @@ from kontronik_can_gw.native.objects import OPTIONS
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.signals.plan import Layout, SendType
-from kontronik_can_gw.times import MS
+from kontronik_can_gw.times import MS, SECOND
 
 SEEDS = 16
 
@@ -184,6 +190,35 @@ def _sort_calls(library: Any, messages: int) -> int:
     assert sorted(cyclic) == [*range(messages, 2 * messages)]
     assert [frame.can_id for frame in frames[messages:]] == [*range(messages)]
     return found
+
+
+def _energy_object() -> SlotPlan:
+    """Return the plan of a PDO with the energy of CANopen, in 0.1 Wh."""
+    eds = load_eds(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
+    (entry,) = (each for each in eds.entries if (each.index, each.sub) == (0x2001, 4))
+    energy = Variable(entry)
+    energy.bound = BINDINGS[0x2001, 4]
+    return compile_pdo([energy])
+
+
+@pytest.mark.parametrize(
+    "mw_s",
+    [(1 << 48) + 1, 10 * 31_557_600 * 100_000_000],
+    ids=["2^48 mW s", "ten years at 100 kW"],
+)
+def test_a_large_energy_is_equal_in_both_cores_and_restarts_at_0(
+    native_library: Any,
+    mw_s: int,
+) -> None:
+    given = (EscSettings(),), Layout("", "", ()), 0, False
+    for core in (PythonCore(*given), NativeCore(native_library, *given, slots=1)):
+        slot = core.slot(0)
+        slot.configure(SlotSettings(_energy_object(), 0x181, True, 0, 0), 0)
+        slot.start(0)
+        core.escs[0].energy_mw_ns = mw_s * SECOND
+        (frame,) = core.take(0)
+        tenths_of_wh = (mw_s + 180_000) // 360_000
+        assert int.from_bytes(frame.data, "little") == tenths_of_wh % (1 << 32), core.language
 
 
 def test_sorting_of_pending_messages_is_not_quadratic(tmp_path: Path) -> None:

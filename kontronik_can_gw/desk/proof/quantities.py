@@ -20,7 +20,9 @@ WIRE_RANGES = {
 }
 """Smallest and greatest number of each type of field."""
 _MOST_COUNTED = 1 << 48
-"""Limit of a counter, and of an energy in mW s."""
+"""Limit of a counter."""
+_MOST_ENERGY = 1 << 55
+"""Limit of an energy in mW s."""
 _MOST_NS = 1 << 61
 """Limit of a time in ns."""
 _JIVEPRO = 3
@@ -220,7 +222,7 @@ def _measured() -> dict[str, Quantity]:
         "battery_power": Quantity(
             _PRODUCT, voltage * low_current, voltage * high_current, live, "W", 1000
         ),
-        "energy_used": Quantity(Read("energy_used"), 0, _MOST_COUNTED, always, "Wh", _ENERGY_STEPS),
+        "energy_used": Quantity(Read("energy_used"), 0, _MOST_ENERGY, always, "Wh", _ENERGY_STEPS),
         "motor_run_time": Quantity(Read("motor_run_time"), 0, _MOST_NS, always, "s", _NS_PER_S),
         "data_age": Quantity(
             Read("data_age"), 0, _MOST_NS // _NS_PER_MS, Presence.AFTER_LIVE, "ms"

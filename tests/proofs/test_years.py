@@ -1,0 +1,54 @@
+"""Both cores run across every wrap of a time or a counter without a difference.
+
+The oracle in years.c computes each CAN frame from exact integers of its own, and never looks into a
+core. ``years.py`` runs ten years of virtual time in the same way.
+"""
+
+from typing import Any
+
+import pytest
+from years import WRAPS, RunInBoth, RunInC, Wrap, library, main
+
+NAMES = [wrap.name for wrap in WRAPS]
+
+
+@pytest.fixture(scope="module")
+def years_library(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return library(tmp_path_factory.mktemp("years"))
+
+
+@pytest.mark.parametrize("wrap", WRAPS, ids=NAMES)
+def test_the_core_in_c_crosses_a_wrap_within_two_minutes(years_library: Any, wrap: Wrap) -> None:
+    run = RunInC(years_library, wrap.started_ns)
+    wrap.cross(run, 60)
+    assert run.oracle.numbers.frames > 40_000
+
+
+@pytest.mark.parametrize("wrap", WRAPS, ids=NAMES)
+def test_the_core_in_python_crosses_a_wrap_and_equals_the_core_in_c(
+    years_library: Any,
+    wrap: Wrap,
+) -> None:
+    run = RunInBoth(years_library, wrap.started_ns)
+    wrap.cross(run, 5)
+    assert run.oracle.numbers.frames > 3_500
+
+
+def test_a_run_without_jumps_crosses_the_end_of_charge_energy_and_positions(
+    years_library: Any,
+) -> None:
+    """An hour: the ESC's charge passes 65 535 five times, and each hour has a gap."""
+    run = RunInC(years_library, 0)
+    run.run(362_000)
+    assert run.oracle.numbers.losses == 2
+
+
+@pytest.mark.parametrize("words", [["--years=0"], ["--years=1e9"], ["--processes=0"]])
+def test_a_length_out_of_range_is_refused_in_one_line(
+    words: list[str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert "--years is 0.0001 to 100, and --processes 1 to 8" in capsys.readouterr().err
