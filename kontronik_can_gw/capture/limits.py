@@ -33,6 +33,14 @@ _LIMITS_OF_ESC = {
     "run_time": END_OF_TIME - 1,
     "losses": MAX_COUNT - 1,
 }
+_LATER_OF_ESC = ("late_frames", "suspect_frames", "line_errors")
+"""Counters that captures before 0.6 do not have."""
+_WINDOW = ("window_ns", "live", "dropped_bytes", "bytes", "crc_errors", "rate", "interval_ns")
+"""Parts of ``EscTelemetry.window``."""
+_MAX_PLACE = 0xFFFF
+"""Limit of alive counters and pages."""
+_MAX_HELD = 0xFF
+"""Limit of the bytes that a decoder holds."""
 _LIMITS_OF_GATEWAY = {
     "started_ns": END_OF_TIME - 1,
     "can_state": 5,
@@ -46,6 +54,27 @@ def check_state(state: Mapping[str, Any]) -> None:
     for esc in state.get("escs", ()):
         for name, high in _LIMITS_OF_ESC.items():
             whole_number(esc[name], 0, high)
+        for name in _LATER_OF_ESC:
+            whole_number(esc.get(name, 0), 0, MAX_COUNT - 1)
+        if "counters" in esc:
+            whole_number(esc["held"], 0, _MAX_HELD)
+            _check_stream(esc["counters"], esc["window"])
+    for alive, place in state.get("messages", ()):
+        whole_number(alive, 0, _MAX_PLACE)
+        whole_number(place, 0, _MAX_PLACE)
+    if "counters" in state:
+        check_counters([whole_number(each, 0, END_OF_TIME) for each in state["counters"]])
     for name, high in _LIMITS_OF_GATEWAY.items():
         if name in state:
             whole_number(state[name], 0, high)
+
+
+def _check_stream(counters: Sequence[Any], window: Sequence[Any]) -> None:
+    for counter in counters:
+        whole_number(counter, 0, MAX_COUNT - 1)
+    for name, number in zip(_WINDOW, window, strict=True):
+        low = -1 if name == "rate" else 0
+        high = END_OF_TIME - 1 if name.endswith("_ns") else MAX_COUNT - 1
+        if name == "rate":
+            high = (1 << 31) - 1
+        whole_number(number, low, high)

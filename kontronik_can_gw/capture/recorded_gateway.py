@@ -176,10 +176,15 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
             "energy": esc.energy_mw_ns,
             "run_time": esc.run_time_ns,
             "losses": esc.losses,
+            "late_frames": esc.late_frames,
+            "suspect_frames": esc.suspect_frames,
+            "line_errors": esc.line_errors,
         }
-        escs.append(counters)
+        escs.append(counters | esc.stream_state())
     return {
         "escs": escs,
+        "messages": gateway.core.places(),
+        "counters": _counters_of(gateway.status),
         "can_state": int(gateway.status.can_state),
         "is_held": int(gateway.is_held),
         "started_ns": gateway.status.started_ns,

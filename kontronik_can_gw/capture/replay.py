@@ -21,6 +21,13 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
 from kontronik_can_gw.status import CanState, GatewayState
+from kontronik_can_gw.times import SECOND
+
+SETTLE_NS = 10 * SECOND
+"""After this time, a replay without the beginning of its run has the state of the live run.
+
+ESCs send info data every five seconds or more often. Messages with several pages send each of them.
+"""
 
 
 class TimedFrame(NamedTuple):
@@ -36,7 +43,8 @@ class Replay:
 
     ``marked``: the gateway's state on the bus is REPLAY instead of RUNNING. ``state``: the counters
     in the header. If the beginning of the run is missing (no START entry), the gateway starts with
-    the first ADVANCE entry and adopts the next STATE entry.
+    the first ADVANCE entry and adopts the STATE entries of the next seconds (SETTLE_NS). After them
+    the messages equal the live ones.
     """
 
     def __init__(
@@ -55,8 +63,10 @@ class Replay:
         self._taken: list[TimedFrame] = []
         """Frames of the last turn. The next entry shows if they were sent."""
         self._started = False
-        self._midway = False
-        """True if the beginning of the run is missing and no STATE entry was found yet."""
+        self._adopt_until: int | None = None
+        """While the beginning of the run is missing, STATE entries up to the first one after this
+        time are adopted. Otherwise None.
+        """
         self._adopt(state or {})
 
     def follow(self, entries: Iterable[Entry]) -> Iterator[TimedFrame]:
@@ -105,7 +115,7 @@ class Replay:
         check_time(came)
         gateway = self.gateway
         if not self._started and kind == EntryKind.ADVANCE:  # the beginning of the run is missing
-            self._midway = True
+            self._adopt_until = now + SETTLE_NS
             self._start(now, True)
         if kind == EntryKind.BYTES:
             gateway.receive_bytes(esc, data, now, came)
@@ -134,11 +144,12 @@ class Replay:
         elif kind == EntryKind.LOST:
             self.lost += sum(read_numbers(data))
         elif kind == EntryKind.STATE:
-            if self._midway:
-                self._midway = False
+            if self._adopt_until is not None:
                 state = read_json(data)
                 check_state(state)
                 self._adopt(state)
+                if now >= self._adopt_until:
+                    self._adopt_until = None
         elif kind != EntryKind.CLOCK:
             _repeat_rare(gateway, entry)
         return []
@@ -175,6 +186,13 @@ class Replay:
             esc.energy_mw_ns = energy
             esc.run_time_ns = run_time
             esc.losses = losses
+            for name in ("late_frames", "suspect_frames", "line_errors"):
+                setattr(esc, name, found.get(name, 0))
+            if "counters" in found:
+                esc.adopt_stream_state(found["counters"], found["held"], found["window"])
+        self.gateway.core.adopt_places(state.get("messages", ()))
+        for name, value in zip(COUNTERS, state.get("counters", ()), strict=False):
+            setattr(self.gateway.status, name, value)
         if "started_ns" in state:
             self.gateway.status.started_ns = state["started_ns"]
         if "heard_ns" in state:

@@ -15,7 +15,7 @@ An adapter that bundles bytes delays them further: by 1 ms, or by 16 ms if that 
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import Any, Self
 
@@ -65,7 +65,8 @@ class EscStream(EscTelemetry):
         """Usual interval between live frames. 0: unknown."""
         self._window_ns = now
         """Start of the current window of rate and quality."""
-        self._window_counters = self.base
+        self._window_counts = _window_counts(self.base)
+        """Live frames, dropped bytes, bytes and CRC errors at its start."""
 
     @property
     def counters(self) -> Counters:
@@ -79,6 +80,25 @@ class EscStream(EscTelemetry):
         decoder.counters = self.counters.copy()
         twin.decoder = decoder
         return twin
+
+    @property
+    def window(self) -> list[int]:
+        rate = -1 if self.frame_rate is None else self.frame_rate
+        return [self._window_ns, *self._window_counts, rate, self._interval_ns]
+
+    def set_window(self, window: Sequence[int]) -> None:
+        self._window_ns, frames, dropped, received, crc_errors, rate, self._interval_ns = window
+        self._window_counts = (frames, dropped, received, crc_errors)
+        self.frame_rate = None if rate < 0 else rate
+
+    @property
+    def held_bytes(self) -> int:
+        return self.decoder.pending
+
+    def set_counters(self, counters: Any) -> None:
+        shift = counters.bytes - self.counters.bytes
+        self.decoder.adopt_counters(counters)
+        self._arrivals = deque([(end + shift, bound) for end, bound in self._arrivals])
 
     def apply(self, settings: EscSettings) -> None:
         super().apply(settings)
@@ -213,7 +233,7 @@ class EscStream(EscTelemetry):
             self.frame_rate = None
             self._interval_ns = 0
             self._window_ns = when
-            self._window_counters = self.counters.copy()
+            self._window_counts = _window_counts(self.counters)
         return events | Event.LIVE
 
     def _integrate(self, live: Data, ns: int) -> None:
@@ -275,24 +295,28 @@ class EscStream(EscTelemetry):
 
     def _close_window(self, now: int) -> int:
         """Compute rate, interval and link quality since the last call. Return the events."""
-        old = self._window_counters
+        old_frames, old_dropped, old_bytes, old_crc_errors = self._window_counts
         new = self.counters
         window_ns = now - self._window_ns
         self._window_ns = now
-        self._window_counters = new.copy()
+        self._window_counts = _window_counts(new)
         self.frame_rate = 0
         self._interval_ns = 0
         if not self.up:
             return Event.SECOND
-        frames = new.live - old.live
+        frames = new.live - old_frames
         # In 0.1 frames per second, rounded.
         self.frame_rate = (20 * SECOND * frames + window_ns) // (2 * window_ns)
         if frames:
             self._interval_ns = window_ns // frames
-        crc_errors = new.crc_errors - old.crc_errors
-        dropped = new.dropped_bytes - old.dropped_bytes
-        received = new.bytes - old.bytes
+        crc_errors = new.crc_errors - old_crc_errors
+        dropped = new.dropped_bytes - old_dropped
+        received = new.bytes - old_bytes
         has_crc_errors = crc_errors >= self.settings.crc_error_threshold
         has_gaps = dropped * _DEGRADED_BYTES_PER_DROPPED > received
         is_degraded = has_crc_errors or has_gaps
         return Event.SECOND | self._set_link(_DEGRADED if is_degraded else _OK)
+
+
+def _window_counts(counters: Counters) -> tuple[int, int, int, int]:
+    return counters.live, counters.dropped_bytes, counters.bytes, counters.crc_errors

@@ -80,6 +80,17 @@ class Core(Protocol):
     def apply(self, esc: int, settings: EscSettings) -> None:
         """Give an ESC other settings."""
 
+    # --- a replay that begins later in a run
+
+    def places(self) -> list[tuple[int, int]]:
+        """Return alive counter and index of the next page of each message."""
+
+    def adopt_places(self, places: Sequence[Sequence[int]]) -> None:
+        """Continue with the alive counters and pages of ``places``.
+
+        Call it also after the windows of ESCs were set, because deadlines change with them.
+        """
+
     # --- time
 
     def expire(self, now: int) -> None:

@@ -241,6 +241,18 @@ class Messages:
         """The time at which ``advance`` must be called, or NEVER."""
         return min([message.due for message in self._timed], default=NEVER)
 
+    # --- a replay that begins later in a run
+
+    def places(self) -> list[tuple[int, int]]:
+        """Return alive counter and index of the next page of each message."""
+        return [(message.alive, message.place) for message in self._messages]
+
+    def adopt_places(self, places: Sequence[Sequence[int]]) -> None:
+        """Continue with the alive counters and pages of ``places``."""
+        for message, (alive, place) in zip(self._messages, places, strict=False):
+            message.alive = alive % max(1, message.alive_modulus)
+            message.place = place % len(message.plan.pages)
+
     # --- what makes messages pending
 
     def on_event(self, esc: int, events: int, now: int) -> None:

@@ -82,6 +82,15 @@ class PythonCore:
         self.shortest_timeout_ns = self._shortest_timeout()
         self._next_expiry = 0
 
+    # --- a replay that begins later in a run
+
+    def places(self) -> list[tuple[int, int]]:
+        return self.messages.places()
+
+    def adopt_places(self, places: Sequence[Sequence[int]]) -> None:
+        self.messages.adopt_places(places)
+        self._next_expiry = 0
+
     def _shortest_timeout(self) -> int:
         return min(esc.settings.timeout_ns for esc in self.escs)
 

@@ -44,7 +44,7 @@ class Reading(NamedTuple):
 
 
 class Counters(Protocol):
-    """Counts of one stream. They never decrease.
+    """Counts of one stream, as a dataclass. They never decrease.
 
     ``dropped_bytes`` counts only bytes that are certainly not part of a frame.
     """
@@ -96,6 +96,12 @@ class Decoder(Protocol):
         """End the stream: return the readings in the pending bytes and drop the rest.
 
         The next call of ``feed`` starts a new stream. The counters continue.
+        """
+
+    def adopt_counters(self, counters: Any) -> None:
+        """Replace the counters. They must agree with the bytes that are held.
+
+        A position in the stream is counted by ``counters.bytes``.
         """
 
 

@@ -4,10 +4,11 @@ core/esc_stream.py, or its twin in C, computes this state from bytes and time. `
 number of nanoseconds of one monotonic clock.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, replace
 from enum import IntEnum
 from fractions import Fraction
-from typing import Self
+from typing import Any, Self
 
 from kontronik_can_gw.esc.decoder import Counters, Data, EscProtocol
 from kontronik_can_gw.esc.protocols import PROTOCOLS
@@ -143,6 +144,54 @@ class EscTelemetry:
     def frozen(self) -> Self:
         """Return a copy that never changes, so that any thread may read it."""
         raise NotImplementedError
+
+    @property
+    def window(self) -> list[int]:
+        """The current second of rate and quality: its beginning, then counters at its beginning.
+
+        The counters are live frames, dropped bytes, bytes and CRC errors. The last two numbers are
+        the frame rate (-1: unknown) and the mean time between live frames in ns.
+        """
+        raise NotImplementedError
+
+    def set_window(self, window: Sequence[int]) -> None:
+        """Replace the current second of rate and quality."""
+        raise NotImplementedError
+
+    def set_counters(self, counters: Any) -> None:
+        """Replace the counters of the stream. They must fit the bytes that are held."""
+        raise NotImplementedError
+
+    @property
+    def held_bytes(self) -> int:
+        """Number of bytes that are held because they may be part of a frame."""
+        raise NotImplementedError
+
+    def stream_state(self) -> dict[str, Any]:
+        """Return the counters, which a replay cannot compute if it begins later in the stream."""
+        counters: Any = self.counters
+        return {
+            "counters": list(astuple(counters)),
+            "held": self.held_bytes,
+            "window": self.window,
+        }
+
+    def adopt_stream_state(
+        self,
+        counters: Sequence[int],
+        held: int,
+        window: Sequence[int],
+    ) -> None:
+        """Continue with the counters of ``stream_state``.
+
+        The rate is only adopted if live data is fresh. The decoder keeps the bytes that it holds,
+        so ``counters.bytes`` differs from the given number if it does not hold the same bytes.
+        """
+        own: Any = self.counters
+        given = type(own)(*counters)
+        self.set_counters(replace(given, bytes=given.bytes - held + self.held_bytes))
+        if self.up:
+            self.set_window(window)
 
     def apply(self, settings: EscSettings) -> None:
         """Replace the settings."""

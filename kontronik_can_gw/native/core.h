@@ -346,8 +346,9 @@ typedef struct {
 
 /* The core. The owner writes only `mask` and `gateway`. Two parts of the gateway itself write more:
    offline.c passes on frames from one core to another (`found`, `read_...`, kcg_esc.count), and
-   native/state.py restores sums and counters at the beginning of a later part of a capture
-   (`energy`, `energy_rest`, `run_time` and `count` of kcg_esc). */
+   native/state.py restores sums and counters when a replay begins later in a run
+   (`energy`, `energy_rest`, `run_time`, `count`, `window`, `window_ns`, `rate` and `interval` of
+   kcg_esc, `alive` and `page` of kcg_sending), and then sets `next_expiry` to 0. */
 typedef struct {
     const kcg_plan *plan;
     kcg_esc *esc;

@@ -2,6 +2,7 @@
 
 import ctypes as c
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, cast
 
 from kontronik_can_gw.core.interface import Follower
@@ -21,7 +22,7 @@ from kontronik_can_gw.native.slots import (
     slot_rows,
     write_message,
 )
-from kontronik_can_gw.native.state import NativeEsc, NativeStatus
+from kontronik_can_gw.native.state import NativeEsc, NativeStatus, adopt_places, places_of
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.native.turns import Turns
 from kontronik_can_gw.signals.plan import Layout
@@ -93,6 +94,9 @@ class NativeCore:
         for settings, state in zip(escs, self.esc_states, strict=True):
             self.escs.append(NativeEsc(settings, state))
         self.own_ids: dict[int, Owner] = own_ids(layout)
+        sending = self.sending[: self.plan.messages]
+        self.places = partial(places_of, sending)
+        self.adopt_places = partial(adopt_places, self.messages, sending, self.state)
         self._slots = Slots(self.escs, self.status)
         self._followers: Sequence[Follower] = ()
         self.choose_events()

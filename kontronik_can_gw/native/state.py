@@ -3,6 +3,7 @@
 import ctypes as c
 import struct
 from collections.abc import Callable, Sequence
+from dataclasses import astuple
 from functools import cache
 from typing import Any, Self
 
@@ -66,6 +67,23 @@ class NativeEsc(EscTelemetry):
         counts = self._state.count[:_STREAM]
         found: Counters = self._counters_of(*counts)
         return found
+
+    @property
+    def window(self) -> list[int]:
+        state = self._state
+        return [state.window_ns, *state.window, state.rate, state.interval]
+
+    def set_window(self, window: Sequence[int]) -> None:
+        state = self._state
+        state.window_ns, *counts, state.rate, state.interval = window
+        state.window[:] = counts  # ctypes keeps the low 32 bits, as the core does
+
+    @property
+    def held_bytes(self) -> int:
+        return int(self._state.held_count)
+
+    def set_counters(self, counters: Any) -> None:
+        self._state.count[:_STREAM] = tuple(max(0, count) for count in astuple(counters))
 
     def reading(self, kind: int) -> Data | None:
         """Return the data of a kind of readings, or None if there are none."""
@@ -167,3 +185,24 @@ class NativeStatus(c.Structure):
 
     def frozen(self) -> "NativeStatus":
         return NativeStatus.from_buffer_copy(self)
+
+
+def places_of(sending: Sequence[Any]) -> list[tuple[int, int]]:
+    """Return alive counter and index of the next page of messages (kcg_sending)."""
+    return [(each.alive, each.page) for each in sending]
+
+
+def adopt_places(
+    messages: Sequence[Any],
+    sending: Sequence[Any],
+    core: Any,
+    places: Sequence[Sequence[int]],
+) -> None:
+    """Continue with the alive counters and pages of ``places_of``.
+
+    The deadlines of the core (kcg) are computed again.
+    """
+    for message, each, (alive, place) in zip(messages, sending, places, strict=False):
+        each.alive = alive % (message.last_alive + 1)
+        each.page = place % max(1, message.pages)
+    core.next_expiry = 0

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from capture_bench import START, Bench, capture, made
 
-from kontronik_can_gw.capture.format import COUNTERS, Entry, EntryKind, numbers_data
+from kontronik_can_gw.capture.format import COUNTERS, Entry, EntryKind, json_payload, numbers_data
 from kontronik_can_gw.capture.limits import check_state
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.desk.recordings.inputs import open_input
@@ -50,6 +50,60 @@ def test_an_impossible_state_is_refused_in_header_and_entry(name: str, tmp_path:
     bad = capture(tmp_path / "bad.kcap", bench.setup, bench.entries, state=_with(name, 1 << 100))
     with pytest.raises(UserError), open_input(bad):
         pass
+
+
+STREAM = {"counters": [1] * 14, "held": 3, "window": [4, 1, 1, 1, 1, -1, 5]}
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"counters": [-1] * 14},
+        {"counters": [1 << 64]},
+        {"held": 256},
+        {"window": [4, 1, 1, 1, 1, -2, 5]},
+        {"window": [4, 1, 1, 1, 1, 1 << 31, 5]},
+        {"window": [4]},
+        {"late_frames": -1},
+    ],
+)
+def test_an_impossible_state_of_a_stream_is_refused(bad: dict[str, Any]) -> None:
+    def with_stream(stream: dict[str, Any]) -> dict[str, Any]:
+        return GOOD | {"escs": [GOOD["escs"][0] | stream]}  # type: ignore[index]
+
+    check_state(with_stream(STREAM))
+    with pytest.raises(ValueError):
+        check_state(with_stream(STREAM | bad))
+
+
+@pytest.mark.parametrize("key", ["messages", "counters"])
+def test_impossible_counters_of_messages_and_gateway_are_refused(key: str) -> None:
+    check_state(GOOD | {"messages": [[3, 0]], "counters": [1] * len(COUNTERS)})
+    with pytest.raises(ValueError):
+        check_state(GOOD | {key: [[1 << 16, 0]] if key == "messages" else [-1] * len(COUNTERS)})
+
+
+@pytest.mark.parametrize("pure", [False, True])
+def test_a_hostile_state_cannot_leave_the_ranges_of_the_core(
+    pure: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if pure:
+        monkeypatch.setenv("KONTRONIK_PURE", "1")
+    bench = Bench(*made(1)).live(1, 3)
+    stream = {"counters": [0] * 14, "held": 255, "window": [0, 9, 9, 9, 9, 7, END_OF_TIME - 1]}
+    state = GOOD | {
+        "escs": [GOOD["escs"][0] | stream],  # type: ignore[index]
+        "messages": [[0xFFFF, 0xFFFF]] * 100,
+        "counters": [1] * len(COUNTERS),
+    }
+    check_state(state)
+    replay = Replay(bench.setup.gateway(bench.layout, START), state)
+    data = json_payload(state)
+    entries = [entry for entry in bench.entries if entry.kind != EntryKind.START]
+    middle = len(entries) // 2
+    entries.insert(middle, Entry(entries[middle].time_ns, EntryKind.STATE, data=data))
+    assert len(list(replay.follow(entries))) > 100
 
 
 @pytest.mark.parametrize(

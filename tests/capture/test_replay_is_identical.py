@@ -19,8 +19,9 @@ from kontronik_can_gw.capture.format import (
     read_json,
 )
 from kontronik_can_gw.capture.recorded_gateway import state_of
-from kontronik_can_gw.capture.replay import Replay, TimedFrame
+from kontronik_can_gw.capture.replay import SETTLE_NS, Replay, TimedFrame
 from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.times import SECOND
 
 GATEWAY_STATUS = 0x6D8
 CAPTURES = Path(__file__).resolve().parents[1] / "golden" / "captures"
@@ -95,6 +96,32 @@ def test_a_replay_that_begins_in_quiet_mode_is_quiet_at_once() -> None:
     before = [each.frame.can_id for each in frames if each.time_ns < telemetry]
     assert before == [GATEWAY_STATUS]
     assert {each.frame.can_id for each in frames} == {each.frame.can_id for each in bench.sent}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("is_wild", [False, True])
+def test_messages_of_a_later_part_alone_are_exact_once_it_has_settled(
+    seed: int,
+    is_wild: bool,
+) -> None:
+    """The recorder writes the state every two seconds. A disturbed stream takes longer."""
+    bench = Bench(*made(2))
+    run = bench.running(seed, wild=is_wild)
+    begin = now = run(7.3)
+    first_entry, first_frame = len(bench.entries), len(bench.sent)
+    state = state_of(bench.gateway)
+    for _ in range(12):
+        data = json_payload(state_of(bench.gateway))
+        bench.entries.append(Entry(now, EntryKind.STATE, data=data))
+        now = run(2)
+    replay = Replay(bench.setup.gateway(bench.layout, START), state)
+    frames = list(replay.follow(bench.entries[first_entry:]))
+    assert replay.rejected == 0
+    settled = begin + SETTLE_NS + (10 if is_wild else 2) * SECOND
+    live = [frame for frame in bench.sent[first_frame:] if frame.time_ns >= settled]
+    assert len(live) > 300
+    found = [frame for frame in frames if frame.time_ns >= settled and not frame.received]
+    assert found == live
 
 
 def test_a_marked_replay_differs_only_in_the_state() -> None:

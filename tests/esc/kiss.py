@@ -83,6 +83,9 @@ class Kiss:
         self._lost = False
         return []
 
+    def adopt_counters(self, counters: Counters) -> None:
+        self.counters = counters
+
     def _drop(self) -> None:
         self.counters.dropped_bytes += len(self._pending)
         self._pending = b""

@@ -218,6 +218,13 @@ class Deframer:
         self._rejected_until = self._base
         return frames
 
+    def adopt_counters(self, counters: Counters) -> None:
+        """Replace the counters. They must agree with the bytes that are held."""
+        shift = counters.bytes - self.counters.bytes
+        self._base += shift
+        self._rejected_until += shift
+        self.counters = counters
+
     def _scan(self, buffer: bytes, has_ended: bool) -> list[Frame]:
         """Return the frames in ``buffer`` and hold its undecided end.
 
