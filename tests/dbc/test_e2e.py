@@ -6,15 +6,15 @@ protocol examples of AUTOSAR_PRS_E2EProtocol.
 
 import json
 import random
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
 import pytest
 from cantools import autosar
 from dbc_bench import compiled, refused
-from e2e import p01, p02, p05, p11
+from e2e import p02
+from e2e_oracle import COUNTER_BITS, DATA_IDS, IDS_OF_2, SINGLE_ID, counter_of, is_right
 from hypothesis import given
 from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get, read
@@ -74,18 +74,6 @@ def test_the_examples_of_the_specification_are_reproduced(
         assert protected.insert_crc(frame, at, counter) == frame
 
 
-Protect = Callable[..., None]
-SINGLE_ID: dict[str, Protect] = {
-    "1A": partial(p01.e2e_p01_protect, data_id_mode=p01.E2E_P01_DATAID_BOTH),
-    "1B": partial(p01.e2e_p01_protect, data_id_mode=p01.E2E_P01_DATAID_ALT),
-    "1C": partial(p01.e2e_p01_protect, data_id_mode=p01.E2E_P01_DATAID_NIBBLE),
-    "5": p05.e2e_p05_protect,
-    "11A": partial(p11.e2e_p11_protect, data_id_mode=p11.E2E_P11_DATAID_BOTH),
-    "11C": partial(p11.e2e_p11_protect, data_id_mode=p11.E2E_P11_DATAID_NIBBLE),
-}
-"""The function of autosar-e2e for each profile with one data id."""
-
-
 @given(st.binary(min_size=3, max_size=64), st.integers(0, 0xFFFF), st.data())
 @pytest.mark.parametrize("name", SINGLE_ID)
 def test_a_crc_equals_the_one_of_the_autosar_package_at_every_place(
@@ -121,21 +109,6 @@ def test_a_crc_with_a_list_of_data_ids_equals_the_one_of_both_packages(
 # --- sent frames
 
 LIVE = LiveData(electrical_speed=70_000, battery_voltage=4442)
-IDS_OF_2 = tuple(random.Random(2).randbytes(16))
-DATA_IDS: dict[str, int | tuple[int, ...]] = {
-    "1A": 0xABCD,
-    "1B": 0xABCD,
-    "1C": 0xACD,
-    "2": IDS_OF_2,
-    "5": 0x8001,
-    "11A": 0x123,
-    "11C": 0x123,
-    "22": IDS_OF_2,
-}
-
-
-COUNTER_BITS = {"5": 8}
-"""Length of the counter, if it is not 4 bits."""
 
 
 def layout_of(name: str, bytes_: int = 8, **settings: Any) -> Layout:
@@ -151,20 +124,6 @@ def layout_of(name: str, bytes_: int = 8, **settings: Any) -> Layout:
         signals.append(Sig("M_DataIDNibble", counter_at + 4, 4))
     settings |= {"e2e": {"M": name}, "e2e_data_ids": {"M": DATA_IDS[name]}}
     return compiled(dbc_text([Msg("M", 0x123, bytes_, signals)]), **settings)
-
-
-def is_right(name: str, data: bytes) -> bool:
-    """Return whether the receiver of the autosar-e2e package accepts a frame."""
-    data_ids = DATA_IDS[name]
-    if isinstance(data_ids, tuple):
-        return p02.e2e_p02_check(data, bytes(data_ids))
-    expected = bytearray(data)
-    SINGLE_ID[name](expected, data_ids, increment_counter=False)
-    return data == expected
-
-
-def counter_of(name: str, data: bytes) -> int:
-    return data[2] if name == "5" else data[1] & 0xF
 
 
 class Sender:
