@@ -62,12 +62,18 @@ def test_each_profile_is_right_on_the_bus_and_from_the_capture(vcan: str, tmp_pa
         gateway = GatewayProcess(config)
         try:
             gateway.wait_for_line("CAN socketcan")
-            for part in (1, 2):
-                sent = len(watch.recorded)
+            for losses in (1, 2):
+
+                def are_sent(more_than: int = len(watch.recorded) + 500) -> bool:
+                    return len(watch.recorded) > more_than
+
+                def is_lost(losses: int = losses) -> bool:
+                    return gateway.log.count("telemetry lost") >= losses
+
                 ports[0].on = True
-                wait_for(lambda sent=sent: len(watch.recorded) > sent + 500, "500 frames")
+                wait_for(are_sent, "500 frames")
                 ports[0].on = False
-                wait_for(lambda part=part: gateway.log.count("telemetry lost") >= part, "a loss")
+                wait_for(is_lost, "the loss of telemetry")
             assert gateway.end() == 0, gateway.log
             watch.wait_for_mark()
         finally:
