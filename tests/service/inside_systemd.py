@@ -26,6 +26,7 @@ from on_board import LIMIT_S, fresh
 PROGRAM = str(Path(sys.prefix, "bin", "kontronik-can-gw"))
 CONFIGURATION = Path("/etc/kontronik-can-gw/gateway.toml")
 UNIT = "kontronik-can-gw.service"
+RESTART = "kontronik-can-gw-restart@vcan0"
 LINK = "/run/esc"
 LOCKS = "/run/kontronik-can-gw/lock"
 FORBIDDEN = "/dev/not_a_serial_port"
@@ -64,8 +65,8 @@ def until(condition: Callable[[], bool]) -> float:
     return -1.0
 
 
-def write_configuration(file: Path, channel: str, port: str) -> None:
-    file.write_text(f'[can]\nchannel = "{channel}"\n[[esc]]\nport = "{port}"\n')
+def write_configuration(file: Path, channel: str, port: str, can: str = "") -> None:
+    file.write_text(f'[can]\nchannel = "{channel}"\n{can}[[esc]]\nport = "{port}"\n')
 
 
 def entries() -> list[dict[str, Any]]:
@@ -126,6 +127,9 @@ def trial(facts: Facts) -> None:
         if Path(path).exists()
     }
 
+    facts["restart"] = interface_restart()
+    pid = shown()["MainPID"]
+
     def is_another() -> bool:
         return shown()["MainPID"] not in ("0", pid) and shown()["ActiveState"] == "active"
 
@@ -170,6 +174,31 @@ def trial(facts: Facts) -> None:
     run("systemctl", "stop", UNIT)
     facts["locks after a stop"] = [path.name for path in Path(LOCKS).iterdir()]
     facts["end"] = service("uninstall")
+
+
+def interface_restart() -> Facts:
+    """Let no frame leave the interface until the restart unit has restarted it.
+
+    A traffic shaper holds the frames: after the first ten, it lets one pass in 16 s.
+    """
+    write_configuration(CONFIGURATION, "vcan0", LINK, "restart_after_s = 0.5\n")
+    found: Facts = {"install": service("install", "--now")}
+    until(lambda: "telemetry ok" in shown()["StatusText"])
+    found["path"] = shown(f"{RESTART}.path")
+    shaper = ("dev", "vcan0", "root")
+    words = ("tbf", "rate", "8bit", "burst", "160", "limit", "1600")
+    found["shaper"] = run("tc", "qdisc", "add", *shaper, *words)
+
+    def is_logged(text: str) -> bool:
+        return any(text in str(entry.get("MESSAGE")) for entry in entries())
+
+    found["restarted"] = until(lambda: is_logged("no frame left it, so it is restarted"))
+    run("tc", "qdisc", "del", *shaper)
+    found["works again"] = until(lambda: is_logged("works again after"))
+    found["service"] = shown(f"{RESTART}.service")
+    found["interface"] = run("ip", "link", "show", "dev", "vcan0")["out"]
+    found["gateway"] = shown()
+    return found
 
 
 def clock_states() -> list[Any]:

@@ -184,6 +184,19 @@ def test_the_state_of_the_clock_is_known_in_the_sandbox(facts: Facts) -> None:
     assert any(message.startswith("the clock was set by +3600.") for message in messages)
 
 
+def test_a_blocked_interface_is_restarted_by_the_restart_unit(facts: Facts) -> None:
+    found = facts["restart"]
+    assert found["install"]["code"] == 0, found["install"]
+    assert found["path"]["UnitFileState"] == "enabled"
+    assert found["path"]["ActiveState"] == "active"
+    assert found["shaper"]["code"] == 0, found["shaper"]
+    assert found["restarted"] >= 0, found
+    assert found["works again"] >= 0, found
+    assert found["service"]["Result"] == "success", found["service"]
+    assert ",UP," in found["interface"]
+    assert found["gateway"]["NRestarts"] == "0", "the gateway itself goes on"
+
+
 def test_metrics_are_served_and_the_gateway_still_cannot_use_ip(facts: Facts) -> None:
     done, text, probe = facts["metrics"]
     assert done["code"] == 0
