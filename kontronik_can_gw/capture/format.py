@@ -26,6 +26,10 @@ Since version 2 the data of BYTES and FRAME begin with a u64 time on the clock o
 BYTES it is a time before any of the bytes arrived, for FRAME the arrival of the CAN frame. Version
 1 does not have it, so the time of the entry is used.
 
+Information blocks hold facts that become known later: the ``devices`` of the ESCs, and the
+``events`` for which a capture was recorded (runtime/files/event_recorder.py). Readers ignore keys
+that they do not know.
+
 Times do not decrease. The entries are all calls to the gateway's core, in order. Their replay gives
 each CAN frame that was sent, at its time.
 """
@@ -149,13 +153,33 @@ class Damage(NamedTuple):
     length: int
 
 
+class Packed(NamedTuple):
+    """The payload of a block as it is stored."""
+
+    is_deflated: bool
+    stored: bytes
+    size: int
+    """Length of the payload when inflated."""
+
+
+def packed(payload: bytes) -> Packed:
+    """Return a payload as it is stored. It is deflated if that makes it shorter."""
+    deflated = zlib.compress(payload, 1)
+    if len(deflated) < len(payload):
+        return Packed(True, deflated, len(payload))
+    return Packed(False, payload, len(payload))
+
+
 def block(kind: bytes, number: int, payload: bytes) -> bytes:
-    """Return one block. It is deflated if that makes it shorter."""
-    packed = zlib.compress(payload, 1)
-    deflated = len(packed) < len(payload)
-    stored = packed if deflated else payload
+    """Return one block."""
+    return block_of(kind, number, packed(payload))
+
+
+def block_of(kind: bytes, number: int, payload: Packed) -> bytes:
+    """Return one block with a payload that is already packed."""
+    stored = payload.stored
     number &= 0xFFFFFFFF
-    head = _HEAD.pack(MAGIC, kind, deflated, 0, len(stored), len(payload), number)
+    head = _HEAD.pack(MAGIC, kind, payload.is_deflated, 0, len(stored), payload.size, number)
     crc = zlib.crc32(stored, zlib.crc32(head))
     return head + _CRC.pack(crc) + stored
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from kontronik_can_gw.assembly.assemble import Loaded, load_configuration
 from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file, option
 from kontronik_can_gw.cli.common import canopen_setup, say, show
-from kontronik_can_gw.cli.recording import in_words, record_folder
+from kontronik_can_gw.cli.recording import events_in_words, in_words, record_folder, ring_size
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.dbc.reader import listed
 from kontronik_can_gw.desk.libraries import missing_library
@@ -164,6 +164,8 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     folder = record_folder(config)
     if folder is not None:
         yield f"  captures  {in_words(config, folder)}"
+        if config.record.on_event:
+            yield f"            {events_in_words(config)}"
     load = shown["bus_load"]
     frames = shown["frames_per_second"]
     yield f"  bus load  {load:.1%}, {frames:.0f} frames/s: ESCs at 100 Hz, worst stuffing, no SDO"
@@ -249,4 +251,5 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
         },
         "outputs": {each.name: lines for each in loaded.outputs if (lines := each.lines())},
         "canopen_nodes": node_ids,
+        "record_ring_bytes": ring_size(config),
     }

@@ -8,6 +8,8 @@ from kontronik_can_gw.capture.recorded_gateway import RecordedGateway, state_of
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.runtime.files.event_recorder import EventRecorder, ring_bytes
+from kontronik_can_gw.runtime.files.event_watch import EventWatch
 from kontronik_can_gw.runtime.files.recorder import Recorder
 from kontronik_can_gw.runtime.system.machine import state_folder
 
@@ -32,6 +34,23 @@ def in_words(config: Config, folder: Path) -> str:
     return words
 
 
+def events_in_words(config: Config) -> str:
+    """Describe in a line when captures are recorded. Empty if everything is recorded."""
+    record = config.record
+    size = ring_size(config)
+    if size is None:
+        return ""
+    return (
+        f"on events, {record.before_s} s before to {record.after_s} s after, "
+        f"at most {size / 1e6:.1f} MB in memory"
+    )
+
+
+def ring_size(config: Config) -> int | None:
+    """Return the greatest size in bytes of the entries in memory. None without on_event."""
+    return ring_bytes(config.record, len(config.esc)) if config.record.on_event else None
+
+
 def recorded(
     loaded: Loaded,
     given: Path | None,
@@ -44,8 +63,12 @@ def recorded(
     """
     folder = record_folder(loaded.config, given)
     assert folder is not None
-    recorder = Recorder(folder, loaded.config.record)
-    recorder.words = in_words(loaded.config, folder)
+    record = loaded.config.record
+    recorder = Recorder(folder, record)
+    if record.on_event:
+        recorder = EventRecorder(folder, record, len(loaded.escs))
+    parts = (in_words(loaded.config, folder), events_in_words(loaded.config))
+    recorder.words = ", ".join(filter(None, parts))
     gateway = RecordedGateway(
         recorder.put,
         loaded.escs,
@@ -55,6 +78,8 @@ def recorded(
         loaded.outputs,
         loaded.config.can.quiet_after_ns,
     )
+    if isinstance(recorder, EventRecorder):
+        EventWatch(gateway, record, recorder.trigger)
     known = {
         "created_ns": now,
         "state": state_of(gateway),

@@ -3,8 +3,11 @@
 import argparse
 import gc
 import logging
+import signal
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,6 +51,7 @@ OPTIONS = (
 )
 EPILOG = (
     "SIGTERM, SIGINT and SIGHUP end it within half a second. "
+    "SIGUSR1 records the time around it, if record.on_event is set. "
     "It reads the configuration only at the start. It only "
     "reads from the serial ports and never transmits to an ESC."
 )
@@ -85,17 +89,32 @@ class _Run:
         self._signals: list[str] = []
         """Name of the signal that ends the run."""
         self._is_stopping = False
+        self._recorder: Recorder | None = None
 
     def main(self) -> None:
         """Run until a signal ends the gateway."""
         sys.setswitchinterval(_LOCK_SWITCH_S)
-        with stopping_on_signals(self._stop) as self._signals:
+        with self._marking_on_signal(), stopping_on_signals(self._stop) as self._signals:
             loop = self._opened()
             self._loop = loop
             if self._is_stopping:  # a signal was received before the loop existed
                 loop.stop(self._reason())
             settle_memory()
             loop.run()
+
+    @contextmanager
+    def _marking_on_signal(self) -> Iterator[None]:
+        """Let SIGUSR1 mark an event. Without ``record.on_event`` it has no effect."""
+
+        def mark(_number: int, _frame: object) -> None:
+            if self._recorder is not None:
+                self._recorder.mark()
+
+        before = signal.signal(signal.SIGUSR1, mark)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGUSR1, before)
 
     def _stop(self) -> None:
         self._is_stopping = True
@@ -127,6 +146,7 @@ class _Run:
         wait = self._args.wait or config.run.wait_for_devices
         _begin_realtime(config.run.realtime_priority, wait)
         gateway, recorder = self._gateway(loaded)
+        self._recorder = recorder
         # They are logged after the start. If the start fails, its error is more important.
         warnings: list[str] = []
         try:

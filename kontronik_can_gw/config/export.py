@@ -46,7 +46,9 @@ def _schema_of_key(row: Field[Any]) -> dict[str, Any]:
     default = row.default
     if isinstance(default, Fraction):
         default = float(default)
-    if default not in (MISSING, None, "", ()):
+    elif isinstance(default, tuple):
+        default = list(default)
+    if default not in (MISSING, None, "", []):
         entry["default"] = default
     return entry
 

@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from kontronik_can_gw.config.conditions import CONDITIONS, ERRORS
 from kontronik_can_gw.config.kinds import (
     BOOLEAN,
     BROKER,
@@ -122,6 +123,18 @@ class RecordConfig:
         "0 removes none")
     min_free_mb: int = key(integer(0, 10_000_000), 100,
         "pause recording while the file system has less free space, in megabytes")
+    on_event: bool = key(BOOLEAN, False,
+        "keep the input in memory, and write a capture only around an event: an error bit, "
+        "a condition of `when`, a loss of telemetry, or the signal USR1")
+    before_s: int = key(integer(1, 600), 30,
+        "on_event: seconds before the first event that a capture has")
+    after_s: int = key(integer(1, 3600), 30,
+        "on_event: seconds after the last event that a capture has")
+    errors: tuple[str, ...] = key(ERRORS, ("error", "warning"),
+        "on_event: error bits that are events, by class or by name")
+    when: tuple[str, ...] = key(CONDITIONS, (),
+        "on_event: conditions that are events, for example \"battery_voltage < 20\" or "
+        "\"esc1.battery_current > 150 A\"")
 
 
 @dataclass(frozen=True)

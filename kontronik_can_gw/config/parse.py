@@ -11,6 +11,7 @@ from pathlib import Path
 from posixpath import normpath
 from typing import Any, cast
 
+from kontronik_can_gw.config.conditions import condition
 from kontronik_can_gw.config.keys import (
     REMOVED_KEYS,
     TABLES,
@@ -229,10 +230,20 @@ def _output_problems(config: Config) -> Iterator[str]:
                 yield f"statistics.file: {str(path)!r} is {what}, which would be overwritten"
     if config.canopen.enabled:
         yield from _node_id_problems(config)
+    yield from _condition_problems(config)
     senders = ("dbc", *OUTPUTS)
     if not any(getattr(config, name).enabled for name in senders):
         names = ", ".join(f"{name}.enabled" for name in senders)
         yield f"{names}: all are false, so nothing would be sent. Enable one."
+
+
+def _condition_problems(config: Config) -> Iterator[str]:
+    known = {normalize(esc.name): esc.name for esc in config.esc}
+    for text in config.record.when:
+        name = condition(text).esc
+        if name and name not in known:
+            names = ", ".join(known.values())
+            yield f"record.when: {text!r}: there is no ESC of this name. Known: {names}."
 
 
 def _node_id_problems(config: Config) -> Iterator[str]:

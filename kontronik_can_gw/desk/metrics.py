@@ -119,6 +119,7 @@ def _samples(document: Document, age_s: float) -> Iterator[Sample]:
         yield "store_failed", store["last_error"] is not None, {}
     if recording is not None:
         yield "recording_failed", recording["problem"] != "", {}
+        yield "recording_events_total", recording.get("events"), {}
     yield from _states("gateway_state", GatewayState, document["gateway"]["state"], {})
     yield "can_info", 1, {"interface": can["interface"], "channel": can["channel"]}
     yield from _states("can_state", CanState, can["state"], {})

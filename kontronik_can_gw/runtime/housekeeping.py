@@ -170,6 +170,8 @@ class Housekeeping:
             return
         self._recorder.note(self._gateway, now)
         self._log(self._recorder.reports(now), now)
+        for name, text in self._recorder.take_events():
+            self._conditions.event(name, text, now, logging.INFO)
 
     def _log(self, reports: Sequence[Report], now: int) -> None:
         for name, begins, text in reports:

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 import kontronik_can_gw
 from kontronik_can_gw.assembly.assemble import load_configuration
+from kontronik_can_gw.config.conditions import condition
 from kontronik_can_gw.config.export import as_toml, schema
 from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, shipped
 from kontronik_can_gw.config.parse import load, parse
@@ -61,6 +62,50 @@ def problems(given_tables: Any) -> list[str]:
         parse(given_tables, "a.toml")
     assert caught.value.exit_code == 2
     return list(caught.value.problems)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("batery_voltage < 3", "there is no value 'batery_voltage'. Did you mean battery_voltage?"),
+        ("left.x < 3", "there is no value 'x'."),
+        ("battery_voltage = 3", "= is unknown. Use one of <, <=, >, >="),
+        ("battery_voltage <> 3", "<> is unknown. Use one of <, <=, >, >="),
+        ("battery_voltage < x", "'x' is not a number"),
+        ("battery_voltage <", "'' is not a number"),
+        ("battery_voltage < 3 A", "'A' is no unit of battery_voltage. Known: V, mV, kV"),
+        ("undervoltage > 0 V", "undervoltage has no unit. Remove 'V'"),
+        ("uptime > 3", "uptime is a value of the gateway, not of an ESC"),
+        ("operating_state > 3", "operating_state is not a number"),
+        ("data_age > 3", "data_age cannot be compared. The loss of telemetry is an event"),
+        ("right.battery_voltage < 3", "there is no ESC of this name. Known: esc1."),
+        ("hello", "'hello' is not a condition such as \"battery_voltage < 20\""),
+        ("x" * 300 + "<", "is not a condition such as"),
+    ],
+)
+def test_a_wrong_condition_is_one_clear_mistake(text: str, problem: str) -> None:
+    [found] = problems(tables("record", "when", [text]))
+    assert found.startswith("a.toml: record.when: ")
+    assert problem in found
+
+
+def test_all_wrong_conditions_and_error_bits_are_named_at_once() -> None:
+    record = {"when": ["a < 1", 3, "battery_voltage < 20"], "errors": ["x", "undervoltag"]}
+    when, errors = problems(tables() | {"record": record})
+    assert "there is no value 'a'" in when
+    assert when.endswith("; 3 is not a string")
+    assert "'x' is neither error, warning or status nor an error bit; 'undervoltag'" in errors
+    assert errors.endswith("Did you mean undervoltage?")
+
+
+def test_a_limit_is_converted_to_the_unit_of_the_value() -> None:
+    for text, limit in (
+        ("battery_voltage<20", 20.0),
+        ("BatteryVoltage < 20500 mV", 20.5),
+        ("esc1.power_stage_temperature > 212 °F", 100.0),
+        ("motor_run_time > 2 min", 120.0),
+    ):
+        assert condition(text).limit == limit
 
 
 # --- each key
@@ -276,7 +321,10 @@ def test_schema_describes_every_key_with_the_default_of_the_parser() -> None:
             assert described["description"]
             if "default" in described:
                 VALIDATOR.evolve(schema=described).validate(described["default"])
-                assert getattr(made, key) == described["default"]
+                default = described["default"]
+                if isinstance(default, list):
+                    default = tuple(default)
+                assert getattr(made, key) == default
             elif (table, key) not in (("esc", "port"), ("esc", "name")):
                 assert not getattr(made, key)
 
@@ -290,6 +338,8 @@ TAKEN: dict[tuple[str, str], list[Any]] = {
     ("esc", "name"): ["a", "Left", "esc_1", "A23456789012"],
     ("esc", "gear"): ["1/1000", "1/3", 9.8],
     ("dbc", "messages"): [["Motor_*", "X"]],
+    ("record", "when"): [["battery_voltage < 20"], ["Battery Current>=1.5e2 A", "throttle > -5"]],
+    ("record", "errors"): [["error", "status"], ["undervoltage", "test_short_to_ground"]],
     ("dbc", "bind"): [{"A": "x", "B": -1.5}],
     ("dbc", "e2e"): [{"Motor_*": "2", "EscSpeed": "11C"}],
     ("dbc", "e2e_data_ids"): [{"EscSpeed": 0, "EscStatus": 0xFFFF, "Motor": [*range(16)]}],
@@ -298,7 +348,7 @@ TAKEN: dict[tuple[str, str], list[Any]] = {
     ("can", "options"): [{"ttyBaudrate": 115200, "host": "a b", "x": 0.5, "y": True}],
 }
 """Values of keys that accept neither any text nor any number in a range."""
-CHANGED_IN_USE = ("gear", "messages", "bind", "e2e_data_ids")
+CHANGED_IN_USE = ("gear", "messages", "bind", "e2e_data_ids", "errors", "when")
 """Keys whose values in use have another form, such as a tuple for a list."""
 
 

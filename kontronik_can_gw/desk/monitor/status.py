@@ -393,3 +393,18 @@ def _further(document: Document) -> Iterator[Text]:
         lost = f", {recording['lost']:.0f} entries lost" if recording["lost"] else ""
         size = f"{recording['bytes'] / 1e6:.1f} MB"
         yield line(f"recording to {recording['file']}, {size}", (lost, "yellow"))
+    if recording and recording.get("on_event"):  # documents before 0.6 do not have it
+        yield from _events(recording)
+
+
+def _events(recording: Document) -> Iterator[Text]:
+    """Yield lines about the recording on events."""
+    if not recording["file"]:
+        size = f"{recording['ring_bytes'] / 1e6:.1f} MB"
+        yield line(f"recording waits for an event, with {size} in memory")
+    event = recording["event"]
+    if event is not None:
+        about = f"{event['esc']}: {event['reason']}" if event["esc"] else event["reason"]
+        place = event["file"] or "not recorded yet"
+        text = f"last event at {event['time']}: {about}, {place}"
+        yield from wrapped(printable(text), "", _WIDTH)

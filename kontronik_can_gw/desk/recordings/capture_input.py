@@ -31,6 +31,8 @@ from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, timed
 from kontronik_can_gw.desk.recordings.trusted_times import TrustedTimes
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.printable import printable
+from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.gateway.gateway import Gateway
@@ -46,6 +48,8 @@ After one of these, it is certain that the frames of the previous turn were sent
 """
 _LOOK_FOR_HEADER = 1 << 25
 """Number of bytes of a part in which the header is looked for."""
+_MAX_EVENTS = 10
+"""Number of events that are listed."""
 _MAX_DAMAGE = 50
 """Number of damaged places that are listed."""
 
@@ -92,6 +96,7 @@ class CaptureInput(PlayedInput):
         self._place = ""
         """File and position of the block that is being read, for messages."""
         self._devices: list[Any] = list(self.header.get("devices") or [])
+        self._events: Any = self.header.get("events")
         self._describe()
 
     def wall_ns(self, time_ns: int) -> int | None:
@@ -242,6 +247,8 @@ class CaptureInput(PlayedInput):
         }
         if isinstance(header.get("clock"), dict):
             self.provenance["clock at the start"] = clock_facts(header).in_words
+        if self._events:
+            self.provenance["recorded because of"] = _events_in_words(self._events, self._begun[0])
         for index, (esc, port) in enumerate(zip(setup.escs, setup.ports, strict=False)):
             known = "unknown device"
             if index < len(self._devices) and isinstance(self._devices[index], dict):
@@ -326,6 +333,7 @@ class CaptureInput(PlayedInput):
                 self._check_part(found, path, part)
             else:
                 self._devices = found.get("devices", self._devices)
+                self._events = found.get("events", self._events)
                 self._describe()
         except ValueError as error:
             self._add_damage(f"{self._place} {error}")
@@ -358,6 +366,19 @@ def _clock_of(header: Mapping[str, Any]) -> tuple[int, int] | None:
     if not (0 <= now <= LATEST_NS and 0 <= wall <= LATEST_NS):
         return None
     return int(now), int(wall) - int(now)
+
+
+def _events_in_words(events: Any, begin_ns: int) -> str:
+    """Return the events of a capture, with their seconds after its beginning."""
+    found = []
+    with suppress(LookupError, TypeError):  # of a damaged header
+        for event in events[:_MAX_EVENTS]:
+            seconds = (event["time_ns"] - begin_ns) / SECOND
+            about = f"{event['esc']}: " if event["esc"] else ""
+            found.append(f"{about}{event['reason']} ({seconds:.1f} s)")
+        if len(events) > _MAX_EVENTS:
+            found.append(f"and {len(events) - _MAX_EVENTS} more")
+    return printable(", ".join(found))
 
 
 def _header_error(path: Path, error: Exception) -> UserError:

@@ -26,10 +26,12 @@ from kontronik_can_gw.capture.format import (
     CLOCK_FLAGS,
     SUFFIX,
     EntryKind,
-    block,
+    Packed,
+    block_of,
     data_payload,
     json_payload,
     numbers_data,
+    packed,
 )
 from kontronik_can_gw.capture.recorded_gateway import devices_of, state_of
 from kontronik_can_gw.config.keys import RecordConfig
@@ -50,7 +52,7 @@ _CHECK_NS = 5 * SECOND
 """Interval between checks of the folder, and between attempts after a failure of the disk."""
 _CLOCK_NS = 10 * SECOND
 """Interval between comparisons of the wall clock with the monotonic clock."""
-_STATE_NS = 2 * SECOND
+STATE_NS = 2 * SECOND
 """Interval between records of the gateway's state."""
 _STEP_NS = MS
 """A larger change of the wall clock is recorded."""
@@ -77,6 +79,9 @@ class RecorderFacts:
 
 class Recorder:
     """Writes the given entries to files, from ``start`` until ``close``."""
+
+    _keeps_items = False
+    """True if entries that could not be written are kept."""
 
     def __init__(
         self,
@@ -163,7 +168,7 @@ class Recorder:
     def note(self, gateway: Gateway, now: int) -> None:
         """Record the gateway's state and devices. A replay of a later part begins with them."""
         self._devices = devices_of(gateway)
-        if now - self._state_ns >= _STATE_NS:
+        if now - self._state_ns >= STATE_NS:
             self._state_ns = now
             self.put(now, EntryKind.STATE, 0, json_payload(state_of(gateway)), 0)
 
@@ -179,6 +184,16 @@ class Recorder:
             taken.append(Report("captures: losses", True, text))
         self.facts.lost = self._overflowed + self._unwritten
         return taken
+
+    def mark(self) -> None:
+        """Report an event that the user has noticed. Only an EventRecorder follows it.
+
+        A signal handler may call it, so it must not use a lock.
+        """
+
+    def take_events(self) -> list[tuple[str, str]]:
+        """Return name and line for the log of each new event. Only an EventRecorder has events."""
+        return []
 
     def close(self) -> None:
         """Write the waiting entries and end the thread. Waits at most 0.35 s for the disk."""
@@ -198,9 +213,11 @@ class Recorder:
             try:
                 self._write(items, now)
             except Exception as error:  # a bug must not end the recorder either
-                self._unwritten += len(items)
+                if not self._keeps_items:
+                    self._unwritten += len(items)
                 self._fail(error, now)
-            if not entries or self._file is None:
+                break
+            if not entries:
                 break
 
     def _write(self, items: list[Item], now: int) -> None:
@@ -217,7 +234,11 @@ class Recorder:
             file.write(b"I", json_payload({"devices": self._recorded_devices}))
         if items:
             self._append_remarks(items, now)
-            file.append(items)
+            file.append(packed(data_payload(items)))
+        self._complete_block(file, now)
+
+    def _complete_block(self, file: "CapturePart", now: int) -> None:
+        """Force the file to the disk. End the part if it is old or large enough."""
         self.facts.bytes += file.sync()
         self.facts.file = str(file.path)
         if self.facts.problem:
@@ -292,15 +313,28 @@ class Recorder:
         now = self._clock()
         self._offset = time.time_ns() - now
         self._clock_ns = now
-        wall = since + self._offset
+        self._recorded_clock = self.clock_facts
+        return self._open_part(since, self._offset, self.clock_facts, self.header)
+
+    def _open_part(
+        self,
+        since: int,
+        offset: int,
+        clock: ClockFacts,
+        known: Mapping[str, Any],
+    ) -> "CapturePart":
+        """Create the next part of the capture.
+
+        ``offset`` and ``clock`` are the state of the wall clock at ``since``. ``known`` has the
+        keys of the header that are the same in all parts.
+        """
+        wall = since + offset
         if not self._stamp:
             self._stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(wall // SECOND))
         part = self._part
         self._part += 1  # also after a failure, so that no name is tried twice
         self._recorded_devices = self._devices
-        clock = self.clock_facts
-        self._recorded_clock = clock
-        header = dict(self.header) | {
+        header = dict(known) | {
             "run": self._run,
             "part": part,
             "monotonic_ns": since,
@@ -316,7 +350,7 @@ class Recorder:
             },
         }
         name = f"{self._stamp}-{self._run[:6]}-{part:05d}{SUFFIX}"
-        return CapturePart(self._folder / name, json_payload(header), now)
+        return CapturePart(self._folder / name, json_payload(header), self._clock())
 
     def _end_part(self) -> None:
         file = self._file
@@ -354,15 +388,18 @@ class CapturePart:
 
     def write(self, kind: bytes, payload: bytes) -> None:
         """Append a block."""
-        data = block(kind, self._number, payload)
+        self._write(kind, packed(payload))
+
+    def _write(self, kind: bytes, payload: Packed) -> None:
+        data = block_of(kind, self._number, payload)
         self._number += 1
         self.size += len(data)
         self._new += len(data)
         write_all(self._fd, data)
 
-    def append(self, items: list[Item]) -> None:
-        """Append a block with entries."""
-        self.write(b"D", data_payload(items))
+    def append(self, payload: Packed) -> None:
+        """Append a block with entries (``data_payload``)."""
+        self._write(b"D", payload)
         if self._header is not None:
             # The header is written twice, because without it the file cannot be read.
             self.write(b"H", self._header)

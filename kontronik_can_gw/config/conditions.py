@@ -1,0 +1,141 @@
+"""Conditions about the values of an ESC, such as "battery_voltage < 20"."""
+
+import operator
+import re
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+from kontronik_can_gw.config.kinds import TEXT, KeyKind
+from kontronik_can_gw.errors import did_you_mean
+from kontronik_can_gw.esc.decoder import Severity
+from kontronik_can_gw.esc.protocols import PROTOCOLS
+from kontronik_can_gw.esc.value_names import VALUES_BY_KEY, normalize
+from kontronik_can_gw.esc.values import Group, Kind, Value
+from kontronik_can_gw.signals.units import conversion, texts_like
+
+_OPERATORS: Mapping[str, Callable[[float, float], bool]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+_FORM = re.compile(r"(?:([^<>=!.]*)\.)?([^<>=!.]*)([<>=!]+)(.*)", re.DOTALL)
+_NUMBER = re.compile(r"\s*([-+]?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]{1,2})?)(.*)", re.DOTALL)
+_EXAMPLE = '"battery_voltage < 20"'
+_LONGEST = 200
+
+
+class Condition(NamedTuple):
+    """A value of an ESC on one side of a limit."""
+
+    text: str
+    """The condition as the user wrote it, without further spaces."""
+    esc: str
+    """Normalized name of the only ESC for which it holds. Empty: all ESCs."""
+    value: Value
+    compare: Callable[[float, float], bool]
+    limit: float
+    """The limit in the unit of the value."""
+
+
+def condition(text: str) -> Condition:
+    """Read a condition. Raises ValueError with the mistake."""
+    match = _FORM.fullmatch(text)
+    if match is None or len(text) > _LONGEST:
+        raise ValueError(f"{text[:_LONGEST]!r} is not a condition such as {_EXAMPLE}")
+    esc, name, sign, rest = match.groups("")
+    if sign not in _OPERATORS:
+        raise ValueError(f"{text!r}: {sign} is unknown. Use one of {', '.join(_OPERATORS)}")
+    value = _value(text, name.strip())
+    limit = _limit(text, rest, value)
+    return Condition(" ".join(text.split()), normalize(esc), value, _OPERATORS[sign], limit)
+
+
+def _value(text: str, name: str) -> Value:
+    value = VALUES_BY_KEY.get(normalize(name))
+    if value is None:
+        near = did_you_mean(name, [each.name for each in VALUES_BY_KEY.values()], 0.5)
+        raise ValueError(f"{text!r}: there is no value {name!r}.{near}")
+    if value.group is Group.GATEWAY:
+        raise ValueError(f"{text!r}: {value.name} is a value of the gateway, not of an ESC")
+    if value.names:
+        raise ValueError(f"{text!r}: {value.name} is not a number")
+    if value.kind is Kind.AGE:
+        raise ValueError(
+            f"{text!r}: {value.name} cannot be compared. "
+            "The loss of telemetry is an event without a condition"
+        )
+    return value
+
+
+def _limit(text: str, rest: str, value: Value) -> float:
+    """Return the limit in the unit of the value."""
+    match = _NUMBER.fullmatch(rest)
+    if match is None:
+        raise ValueError(f"{text!r}: {rest.strip()!r} is not a number")
+    number = Fraction(match[1])
+    unit = match[2].strip()
+    if unit:
+        if not value.unit:
+            raise ValueError(f"{text!r}: {value.name} has no unit. Remove {unit!r}")
+        factors = conversion(unit, value.unit)
+        if factors is None:
+            units = ", ".join(texts_like(value.unit)) or value.unit
+            raise ValueError(f"{text!r}: {unit!r} is no unit of {value.name}. Known: {units}")
+        number = number * factors[0] + factors[1]
+    return float(number)
+
+
+def _check_conditions(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise ValueError(f"{value!r} is not a list of conditions such as [{_EXAMPLE}]")
+    _check_each(value, lambda text: condition(TEXT.check(text)))
+    return tuple(value)
+
+
+def _check_each(values: list[Any], check: Callable[[Any], object]) -> None:
+    """Check all entries of a list. Raises ValueError with the mistakes of all entries."""
+    problems = []
+    for value in values:
+        try:
+            check(value)
+        except ValueError as error:
+            problems.append(str(error))
+    if problems:
+        raise ValueError("; ".join(problems))
+
+
+_TEXT = {"type": "string", "pattern": r"^[^<>=!]*[<>]=?\s*[-+]?[0-9].*$"}
+CONDITIONS = KeyKind("list of conditions", {"type": "array", "items": _TEXT}, _check_conditions)
+
+
+def _error_names() -> list[str]:
+    """Return the classes of error bits, and the names of all bits."""
+    names = [severity.value for severity in Severity]
+    for protocol in PROTOCOLS:
+        for bits in protocol.errors.values():
+            names += [bit.text for bit in bits]
+    return list(dict.fromkeys(names))
+
+
+def _check_error(value: Any) -> None:
+    text = TEXT.check(value)
+    names = _error_names()
+    if text not in names:
+        near = did_you_mean(text, names).replace(" Did", ". Did")
+        raise ValueError(f"{text!r} is neither error, warning or status nor an error bit{near}")
+
+
+def _check_errors(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise ValueError(f'{value!r} is not a list such as ["error", "undervoltage"]')
+    _check_each(value, _check_error)
+    return tuple(value)
+
+
+ERRORS = KeyKind(
+    "list of error, warning, status and error bits",
+    {"type": "array", "items": {"type": "string", "enum": _error_names()}},
+    _check_errors,
+)

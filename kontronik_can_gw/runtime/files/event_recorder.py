@@ -1,0 +1,346 @@
+"""Captures the time around events: keeps the input in memory, and writes it when an event occurs.
+
+The recorder's thread moves the entries to a ring of about ``before_s`` seconds. With an event, the
+ring becomes the beginning of a capture, which continues until ``after_s`` seconds after the last
+event. Each capture is a run of its own. If events are close together, captures can have entries in
+common.
+
+The ring is cut into segments, each of which begins with a STATE entry, and only whole segments are
+dropped. A replay has the exact state ``SETTLE_NS`` after its beginning, so the ring is longer than
+``before_s`` by that time.
+"""
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from kontronik_can_gw.capture.format import (
+    EntryKind,
+    Packed,
+    data_payload,
+    json_payload,
+    packed,
+    read_json,
+)
+from kontronik_can_gw.capture.replay import SETTLE_NS
+from kontronik_can_gw.config.keys import RecordConfig
+from kontronik_can_gw.runtime.files.recorder import (
+    STATE_NS,
+    CapturePart,
+    Item,
+    Recorder,
+    RecorderFacts,
+)
+from kontronik_can_gw.runtime.status.facts import utc
+from kontronik_can_gw.runtime.system.clock import ClockFacts
+from kontronik_can_gw.times import SECOND
+
+_MARGIN_NS = SETTLE_NS + STATE_NS
+"""Time by which the ring is longer than ``before_s``."""
+_BYTES_PER_S = 20_000
+"""Size of an ESC's second in memory, at most. Usually a second at 100 Hz needs less than half."""
+_MAX_LISTED = 100
+"""Number of events that a capture lists. Later ones are only counted."""
+_MAX_WAITING = 1000
+"""Number of events that can occur within half a second."""
+
+
+def ring_bytes(config: RecordConfig, escs: int) -> int:
+    """Return the greatest size of the ring in memory."""
+    seconds = config.before_s + (_MARGIN_NS + STATE_NS) // SECOND
+    return escs * seconds * _BYTES_PER_S
+
+
+class FlightEvent(NamedTuple):
+    """An event that is recorded."""
+
+    time_ns: int
+    """Time on the monotonic clock."""
+    wall: float
+    """Unix time in seconds."""
+    esc: str
+    """Name of the ESC. Empty if the event does not belong to an ESC."""
+    reason: str
+
+    @property
+    def in_words(self) -> str:
+        return f"{self.esc}: {self.reason}" if self.esc else self.reason
+
+
+@dataclass
+class EventRecorderFacts(RecorderFacts):
+    """The state of the recording on events, for the status document."""
+
+    on_event: bool = True
+    ring_bytes: int = 0
+    """Size of the entries that are kept in memory."""
+    events: int = 0
+    """Number of events since the start."""
+    event: dict[str, str] | None = None
+    """The last event: its ``time`` in UTC, ``esc``, ``reason`` and ``file``.
+
+    The file is empty until the event is recorded.
+    """
+
+
+class Segment(NamedTuple):
+    """A part of the ring. It begins with a STATE entry, except at the start of the gateway."""
+
+    begin_ns: int
+    state: bytes
+    """The data of the STATE entry. Empty at the start of the gateway."""
+    offset: int
+    """Time of the wall clock minus the monotonic clock at its beginning, in ns."""
+    clock: ClockFacts
+
+
+class Chunk(NamedTuple):
+    """Some entries of a segment, packed."""
+
+    number: int
+    """Counts up from 1."""
+    begin_ns: int
+    segment: Segment
+    payload: Packed
+    entries: int
+    """Number of entries."""
+
+
+class Ring:
+    """The last entries, packed. Bounded in time and in bytes.
+
+    Entries stay in the ring after they were written, so that the next capture can begin with them.
+    """
+
+    def __init__(self, keep_ns: int, max_bytes: int) -> None:
+        self.bytes = 0
+        self.written = 0
+        """Number of the last chunk that is in the capture."""
+        self._keep_ns = keep_ns
+        self._max_bytes = max_bytes
+        self._segments: deque[Segment] = deque()
+        self._chunks: deque[Chunk] = deque()
+        self._number = 0
+        self._is_cut = False
+        """True if entries are ignored until the next segment begins."""
+
+    def add(
+        self,
+        items: Sequence[Item],
+        offset: int,
+        clock: ClockFacts,
+        holds: bool = False,
+    ) -> int:
+        """Append entries. Return the number of dropped entries that were not written.
+
+        ``holds``: old entries are kept until the size is reached, because a disk that fails should
+        not cost the seconds before an event.
+        """
+        lost = 0
+        for part in _cut(items):
+            begin_ns, kind, _, state, _, _ = part[0]
+            if kind == EntryKind.STATE:
+                self._segments.append(Segment(begin_ns, state, offset, clock))
+                self._is_cut = False
+            elif self._is_cut:
+                lost += len(part)
+                continue
+            elif not self._segments:
+                self._segments.append(Segment(begin_ns, b"", offset, clock))
+            self._number += 1
+            payload = packed(data_payload(part))
+            chunk = Chunk(self._number, begin_ns, self._segments[-1], payload, len(part))
+            self._chunks.append(chunk)
+            self.bytes += len(payload.stored)
+            if not holds:
+                lost += self._drop_old(part[-1][0])
+            while self.bytes > self._max_bytes:
+                lost += self._drop_segment()
+                self._is_cut = not self._segments
+        return lost
+
+    def _drop_old(self, newest_ns: int) -> int:
+        """Drop old segments. Return the number of their entries that were not written."""
+        segments = self._segments
+        lost = 0
+        while len(segments) > 1 and segments[1].begin_ns <= newest_ns - self._keep_ns:
+            lost += self._drop_segment()
+        return lost
+
+    def _drop_segment(self) -> int:
+        segment = self._segments.popleft()
+        lost = 0
+        while self._chunks and self._chunks[0].segment is segment:
+            chunk = self._chunks.popleft()
+            self.bytes -= len(chunk.payload.stored)
+            if chunk.number > self.written:
+                lost += chunk.entries
+        return lost
+
+    def unwritten(self, end_ns: int) -> list[Chunk]:
+        """Return the chunks that were not written, of segments that begin before ``end_ns``."""
+        return [
+            chunk
+            for chunk in self._chunks
+            if chunk.number > self.written and chunk.segment.begin_ns < end_ns
+        ]
+
+    def is_complete(self, end_ns: int) -> bool:
+        """Return True if no entry can be added to the segments that begin before ``end_ns``."""
+        return bool(self._segments) and self._segments[-1].begin_ns >= end_ns
+
+
+def _cut(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
+    """Cut entries before each STATE entry."""
+    begin = 0
+    for place, item in enumerate(items):
+        if item[1] == EntryKind.STATE and place > begin:
+            yield items[begin:place]
+            begin = place
+    if begin < len(items):
+        yield items[begin:]
+
+
+class EventRecorder(Recorder):
+    """Writes captures of the time around events. ``trigger`` reports an event."""
+
+    facts: EventRecorderFacts
+    _keeps_items = True
+
+    def __init__(
+        self,
+        folder: Path,
+        config: RecordConfig,
+        escs: int,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        super().__init__(folder, config, clock)
+        self.facts = EventRecorderFacts()
+        self._ring = Ring(config.before_s * SECOND + _MARGIN_NS, ring_bytes(config, escs))
+        self._after_ns = config.after_s * SECOND
+        self._triggers: deque[FlightEvent] = deque(maxlen=_MAX_WAITING)
+        self._until_ns: int | None = None
+        """Time at which the capture may end. None while nothing is recorded."""
+        self._listed: list[FlightEvent] = []
+        """The first events of the capture."""
+        self._is_list_written = True
+        self._has_next_part = False
+        """True if the next part continues a capture."""
+        self._new: list[FlightEvent] = []
+        """Events that were not logged yet."""
+        self._lines: deque[tuple[str, str]] = deque(maxlen=_MAX_WAITING)
+
+    # --- in the loop's thread
+
+    def mark(self) -> None:
+        self.trigger(self._clock(), time.time(), "", "signal USR1")
+
+    def trigger(self, time_ns: int, wall: float, esc: str, reason: str) -> None:
+        """Report an event. Never waits."""
+        self._triggers.append(FlightEvent(time_ns, wall, esc, reason))
+
+    def take_events(self) -> list[tuple[str, str]]:
+        return [self._lines.popleft() for _ in range(len(self._lines))]
+
+    # --- in the recorder's thread
+
+    def _write(self, items: list[Item], now: int) -> None:
+        if items:
+            self._append_remarks(items, now)
+            is_active = self._until_ns is not None
+            holds = is_active and self._file is None
+            dropped = self._ring.add(items, self._offset, self._recorded_clock, holds)
+            if is_active:
+                self._unwritten += dropped
+        self.facts.ring_bytes = self._ring.bytes
+        self._take_triggers()
+        if now >= self._check_ns:
+            self._check(now)
+        if self._is_usable and self._until_ns is not None:
+            self._write_ring(self._until_ns, now)
+        elif self._is_usable and self.facts.problem:
+            self._note_problem("", f"{self._folder}: can be used again")
+        self._make_lines()
+
+    def _fail(self, error: Exception, now: int) -> None:
+        super()._fail(error, now)
+        self._has_next_part = False
+        self._make_lines()
+
+    def _take_triggers(self) -> None:
+        """Begin or extend the capture for the events that have occurred."""
+        for _ in range(len(self._triggers)):
+            event = self._triggers.popleft()
+            self._until_ns = max(self._until_ns or 0, event.time_ns + self._after_ns)
+            self._new.append(event)
+            if len(self._listed) < _MAX_LISTED:
+                self._listed.append(event)
+                self._is_list_written = False
+            self.facts.events += 1
+            self.facts.event = {
+                "time": utc(event.wall),
+                "esc": event.esc,
+                "reason": event.reason,
+                "file": self.facts.file,
+            }
+
+    def _make_lines(self) -> None:
+        """Make a line for the log about each new event."""
+        place = f"recording to {self.facts.file or self._folder}"
+        if self.facts.problem:
+            place = f"cannot be recorded yet: {self.facts.problem}"
+        for event in self._new:
+            name = f"event: {event.in_words}"
+            self._lines.append((name, f"{name}: {place}"))
+        self._new = []
+
+    def _write_ring(self, until_ns: int, now: int) -> None:
+        """Write the entries of the ring. End the capture if no entry can follow."""
+        if not self._has_next_part and self._file is None:
+            self._ring.written = 0  # the capture begins with the whole ring
+        chunks = self._ring.unwritten(until_ns)
+        if self._file is None and chunks:
+            self._file = self._begin_file(chunks[0])
+        file = self._file
+        if file is not None:
+            for chunk in chunks:
+                file.append(chunk.payload)
+                self._ring.written = chunk.number
+            if not self._is_list_written or self._devices != self._recorded_devices:
+                self._recorded_devices = self._devices
+                file.write(b"I", json_payload({"devices": self._devices, "events": self._list}))
+                self._is_list_written = True
+            self._complete_block(file, now)
+            self._has_next_part = self._file is None
+            if self.facts.event is not None:
+                self.facts.event = self.facts.event | {"file": str(file.path)}
+        if self._ring.is_complete(until_ns):
+            self._end_capture()
+
+    @property
+    def _list(self) -> list[dict[str, Any]]:
+        """The events as JSON."""
+        return [event._asdict() for event in self._listed]
+
+    def _begin_file(self, first: Chunk) -> CapturePart:
+        """Create the first part of a capture, or the next one. ``first`` is its first chunk."""
+        if not self._has_next_part:
+            self._run = os.urandom(8).hex()
+            self._stamp = ""
+            self._part = 0
+        segment = first.segment
+        known = dict(self.header) | {"events": self._list}
+        if segment.state:
+            known["state"] = read_json(segment.state)
+        self._is_list_written = True
+        return self._open_part(first.begin_ns, segment.offset, segment.clock, known)
+
+    def _end_capture(self) -> None:
+        self._end_part()
+        self._until_ns = None
+        self._has_next_part = False
+        self._listed = []

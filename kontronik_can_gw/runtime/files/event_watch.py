@@ -1,0 +1,157 @@
+"""Notices the events for which a capture is recorded.
+
+The core calls ``_follow`` with each change, in both languages. So an error bit is noticed even if
+it is set in a single frame, and a limit even if a single frame crosses it. Error bits and losses
+cost nothing until they change. Conditions about live data make the core report each live frame.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+
+from kontronik_can_gw.config.conditions import Condition, condition
+from kontronik_can_gw.config.keys import RecordConfig
+from kontronik_can_gw.core.interface import Follower
+from kontronik_can_gw.esc.decoder import ErrorBit, Severity, bit_texts
+from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
+from kontronik_can_gw.esc.value_names import normalize
+from kontronik_can_gw.esc.values import Group, Value, physical, steps, values_of
+from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.times import SECOND
+
+OnEvent = Callable[[int, float, str, str], None]
+"""Takes monotonic time in ns, Unix time in seconds, name of the ESC, and the reason."""
+_WORDS = ("operating_errors", "selftest_errors")
+_ALL_BITS = -1
+_REARM_NS = SECOND
+"""Time for which a condition must be unmet before it can be an event again."""
+
+
+class EventWatch:
+    """Watches the ESCs of a gateway. It only reads."""
+
+    def __init__(
+        self,
+        gateway: Gateway,
+        config: RecordConfig,
+        on_event: OnEvent,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        self._status = gateway.status
+        self._on_event = on_event
+        self._wall = wall
+        self._escs = [_WatchedEsc(esc, config) for esc in gateway.escs]
+        events = Event.LINK | Event.STATE | Event.INFO
+        for esc in self._escs:
+            for limit in esc.limits:
+                events |= limit.events
+        follower = Follower(events, self._follow)
+        gateway.core.followers = [*gateway.core.followers, follower]
+
+    def _follow(self, index: int, events: int, now: int) -> None:
+        esc = self._escs[index]
+        reasons = []
+        if events & Event.LINK and esc.has_lost_telemetry():
+            reasons.append("telemetry lost")
+        if events & (Event.STATE | Event.INFO):
+            reasons += esc.new_errors()
+        for limit in esc.limits:
+            if events & limit.events:
+                count = steps(limit.value, esc.state, self._status, now)
+                if limit.is_crossed(physical(limit.value, esc.state, count), now):
+                    reasons.append(limit.condition.text)
+        for reason in reasons:
+            self._on_event(now, self._wall(), esc.state.settings.name, reason)
+
+
+class _Limit:
+    """A condition about one ESC."""
+
+    def __init__(self, about: Condition, value: Value) -> None:
+        self.condition = about
+        self.value = value
+        self.events = _EVENTS[value.pace or value.group]
+        """Events with which the value may have changed."""
+        self._is_armed = True
+        self._unmet_since: int | None = None
+
+    def is_crossed(self, number: float | None, now: int) -> bool:
+        """Return True if the condition is met, and was not met for a second before.
+
+        So a value that is noisy at its limit makes one event. A value that is not available changes
+        nothing.
+        """
+        if number is None:
+            return False
+        if not self.condition.compare(number, self.condition.limit):
+            if self._unmet_since is None:
+                self._unmet_since = now
+            elif now - self._unmet_since >= _REARM_NS:
+                self._is_armed = True
+            return False
+        was_armed = self._is_armed
+        self._is_armed = False
+        self._unmet_since = None
+        return was_armed
+
+
+_EVENTS = {
+    Group.LIVE: Event.LIVE,
+    Group.INFO: Event.INFO,
+    Group.LINK: Event.LINK | Event.SECOND,
+}
+
+
+class _WatchedEsc:
+    """What is remembered of one ESC."""
+
+    def __init__(self, state: EscTelemetry, config: RecordConfig) -> None:
+        self.state = state
+        self.limits = []
+        name = normalize(state.settings.name)
+        for text in config.when:
+            about = condition(text)
+            if about.esc in ("", name):
+                value = values_of(state.protocol)[about.value.name]
+                self.limits.append(_Limit(about, value))
+        errors = state.protocol.errors
+        self._bits: list[Sequence[ErrorBit]] = [errors.get(word, ()) for word in _WORDS]
+        self._masks = [_mask(bits, config.errors) for bits in self._bits]
+        self._words = [0] * len(_WORDS)
+        self._had_telemetry = False
+
+    def has_lost_telemetry(self) -> bool:
+        """Return True if live data was fresh at the last call, and is not any more."""
+        had_telemetry = self._had_telemetry
+        self._had_telemetry = self.state.up
+        return had_telemetry and not self._had_telemetry
+
+    def new_errors(self) -> list[str]:
+        """Return the texts of the error bits that have been set since the last call.
+
+        While a word is not available, its bits keep their state.
+        """
+        texts = []
+        for place, reading in enumerate((self.state.live, self.state.info)):
+            word = self.state.protocol.value(_WORDS[place], reading)
+            if word is not None:
+                risen = word & ~self._words[place] & self._masks[place]
+                self._words[place] = word
+                texts += bit_texts(risen, self._bits[place])
+        return texts
+
+
+def _mask(bits: Sequence[ErrorBit], chosen: Sequence[str]) -> int:
+    """Return the bits of a word that are in ``chosen``: names of bits, or severities.
+
+    A bit without a name is an error.
+    """
+    mask = 0
+    if Severity.ERROR.value in chosen:
+        mask = _ALL_BITS
+    for bit in bits:
+        is_chosen = bit.text in chosen or bit.severity.value in chosen
+        if is_chosen:
+            mask |= 1 << bit
+        else:
+            mask &= ~(1 << bit)
+    return mask
