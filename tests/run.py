@@ -95,7 +95,7 @@ STEPS = {
     "machines": f"{PYTEST} -s tests/native/on_machines.py",
     "fuzz": f"KCG_FUZZ_SECONDS=600 {PYTEST} {FUZZ_OPTIONS} tests/native/test_fuzz.py",
     "proofs": (f"{PYTEST} -s {PROOF_OPTIONS} tests/proofs/long_*.py tests/proofs/real_dbcs.py"),
-    "years": "python tests/proofs/years.py {args}",
+    "years": "python tests/proofs/years_run.py {args}",
     "deb": f"{PYTEST} -o faulthandler_timeout=900 tests/deb/in_fresh_roots.py",
 }
 TIERS = {

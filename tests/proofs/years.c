@@ -570,6 +570,14 @@ static void pdo(const years *y, uint32_t id, int64_t now, struct bits *b)
     }
 }
 
+/* Returns the content of a PDO at this time. The objects have the same values for SDO. */
+uint64_t years_pdo(const years *y, int64_t now, uint32_t id)
+{
+    struct bits right = {0, 0};
+    pdo(y, id, now, &right);
+    return right.all;
+}
+
 /* --- transfers of DroneCAN ------------------------------------------------------------------- */
 
 static uint32_t crc_16(uint32_t crc, const uint8_t *data, int size)

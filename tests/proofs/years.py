@@ -1,21 +1,10 @@
-"""Runs the cores for years of virtual time, across every wrap of a time or a counter.
+"""Runs the cores across every wrap of a time or a counter, with the oracle of years.c.
 
-    python tests/proofs/years.py [--years N] [--processes N]
-
-years.c generates the telemetry and checks the content and the distance of each CAN frame. First the
-core in C runs a minute across every wrap in ``WRAPS``. Then it runs without a jump for N years of
-virtual time (default: ten), at 100 frames a second, in several processes which begin at different
-times. The exit code is 1 after the first difference, or if the resident memory grows.
+``WRAPS`` lists them. years_run.py runs the core in C for years.
 """
 
-import argparse
 import ctypes as c
-import os
-import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -27,6 +16,7 @@ from built import built
 
 from kontronik_can_gw.canopen.bound_values import compile_pdo
 from kontronik_can_gw.canopen.dictionary import Variable
+from kontronik_can_gw.canopen.eds import TYPE_BITS
 from kontronik_can_gw.canopen.eds import load as load_eds
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import shipped
@@ -37,6 +27,7 @@ from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.esc_report import fill, plans_of
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, FIRST_PART, PARTS
 from kontronik_can_gw.native.binding import load
 from kontronik_can_gw.native.core import NativeCore
@@ -50,6 +41,8 @@ SETTINGS = EscSettings("esc", 7, Fraction(41, 12), 6)
 STEP_NS = 10 * MS
 YEAR_S = 365 * 86_400 + 86_400 // 4
 DBC = shipped("dbc/kontronik_esc.dbc")
+EDS = load_eds(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
+ENTRIES = {(entry.index, entry.sub): entry for entry in EDS.entries}
 PDOS = {
     0x181: ((0x2001, 4), (0x2001, 6)),
     0x182: ((0x2021, 3), (0x2021, 5)),
@@ -67,9 +60,6 @@ TRANSFERS = {wire.STATUS: 10, wire.TEMPERATURE: 1}
 """Types of DroneCAN, and how often a second each is sent."""
 
 
-MINUTE_S = 60
-MAX_GROWTH_KIB = 64
-"""Limit of the resident memory after the first tenth of a run."""
 _BEFORE = {
     "bytes": 20_000,
     "lives": 400,
@@ -204,6 +194,7 @@ def library(folder: Path) -> Any:
         "preset": (None, pointer, pointer),
         "pass": (None, pointer, time_ns),
         "step": (c.c_int, pointer, c.c_char_p),
+        "pdo": (number, pointer, time_ns, c.c_uint32),
         "frame": (None, pointer, time_ns, c.c_uint32, c.c_char_p, c.c_int),
         "end_step": (None, pointer, c.c_int),
         "run": (c.c_int, pointer, pointer, number),
@@ -220,12 +211,10 @@ def library(folder: Path) -> Any:
 def add_slots(core: Any, now: int, with_python: bool) -> None:
     """Configure and start the PDOs and the DroneCAN messages of a core."""
     settings = []
-    eds = load_eds(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
-    entries = {(entry.index, entry.sub): entry for entry in eds.entries}
     for cob_id, objects in (PDOS | (PDOS_IN_PYTHON if with_python else {})).items():
         mapped = []
         for index_and_sub in objects:
-            variable = Variable(entries[index_and_sub])
+            variable = Variable(ENTRIES[index_and_sub])
             variable.bound = BINDINGS[index_and_sub]
             mapped.append(variable)
         timer_ns = 500 * MS if cob_id == 0x181 else SECOND
@@ -359,6 +348,24 @@ class RunInBoth:
             self._take(after)
             oracle.library.years_end_step(oracle.memory, 2)
             assert not oracle.problem, oracle.problem
+            if numbers.steps % (SECOND // STEP_NS) == 0:
+                self._read_objects(after)
+
+    def _read_objects(self, now: int) -> None:
+        """Read the objects of the PDOs as SDO does. An unavailable value is all ones here."""
+        for cob_id, objects in (PDOS | PDOS_IN_PYTHON).items():
+            right = self.oracle.library.years_pdo(self.oracle.memory, now, cob_id)
+            if any(BINDINGS[place].source.group is Group.LIVE for place in objects):
+                continue  # after a loss it is not sent, but SDO has an answer
+            for core in self.cores:
+                bits = at = 0
+                for place in objects:
+                    length = TYPE_BITS[ENTRIES[place].data_type]
+                    high = (1 << length) - 1
+                    value = BINDINGS[place].read(core.escs[0], core.status, now, high)
+                    bits |= (high if value is None else value) << at
+                    at += length
+                assert bits == right, f"SDO of {cob_id:X}h: {bits:016x} instead of {right:016x}"
 
     def _take(self, now: int) -> None:
         oracle = self.oracle
@@ -380,103 +387,3 @@ class RunInBoth:
             status.replaced_frames = numbers.replaced
             status.send_failures = numbers.failures
             status.can_restarts = numbers.restarts
-
-
-# --- the release run
-
-
-def resident_kib() -> int:
-    """Return the resident memory of this process."""
-    text = Path("/proc/self/statm").read_text()
-    return int(text.split()[1]) * os.sysconf("SC_PAGESIZE") // 1024
-
-
-def start_of(share: int, shares: int, length_s: float) -> int:
-    """Return the time at which a share of the run begins.
-
-    The first one begins with the clock, the second one crosses 2^31 s in its middle, and others
-    cross 2^53 ns, 2^54 ns and so on.
-    """
-    if share == 0:
-        return SECOND
-    middle = (1 << 31) * SECOND if share == 1 else 1 << 51 + share
-    return max(SECOND, middle - int(length_s / 2 * SECOND))
-
-
-def run_share(share: int, shares: int, years: float) -> int:
-    """Run a share of the years in this process. Return the exit code."""
-    steps = int(years * YEAR_S) * SECOND // STEP_NS // shares
-    with tempfile.TemporaryDirectory(prefix="kcg-years.") as folder:
-        run = RunInC(library(Path(folder)), start_of(share, shares, steps / 100))
-    parts = 1000
-    first_kib = 0
-    most_kib = 0
-    begin = time.monotonic()
-    for part in range(parts):
-        try:
-            run.run(steps * (part + 1) // parts - steps * part // parts)
-        except AssertionError as error:
-            print(f"process {share + 1}: {error}", file=sys.stderr, flush=True)
-            return 1
-        resident = resident_kib()
-        if part + 1 == parts // 10:
-            first_kib = resident
-        most_kib = max(most_kib, resident - first_kib if first_kib else 0)
-        if (part + 1) % 10 == 0:
-            done = years / shares * (part + 1) / parts
-            left_s = (time.monotonic() - begin) * (parts - part - 1) / (part + 1)
-            text = f"process {share + 1}: {done:.4f} years, {left_s:.0f} s left, {resident} KiB"
-            print(text, file=sys.stderr, flush=True)
-    numbers = run.oracle.numbers
-    print(
-        f"process {share + 1}: {numbers.steps} steps, {numbers.frames} CAN frames, "
-        f"{numbers.losses} losses, time {start_of(share, shares, steps / 100) / SECOND:.0f} s to "
-        f"{numbers.now / SECOND:.0f} s, memory +{most_kib} KiB after the first tenth",
-        flush=True,
-    )
-    return int(most_kib > MAX_GROWTH_KIB)
-
-
-def cross_in_c(library: Any, half_s: float) -> Iterator[Wrap]:
-    """Run the core in C across each wrap. Raises AssertionError with the first difference."""
-    for wrap in WRAPS:
-        try:
-            wrap.cross(RunInC(library, wrap.started_ns), half_s)
-        except AssertionError as error:
-            raise AssertionError(f"{wrap.name}: {error}") from None
-        yield wrap
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--years", type=float, default=10, help="years of virtual time, 0.0001 on")
-    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--share", type=int, help=argparse.SUPPRESS)
-    args = parser.parse_args(words)
-    if not 0.0001 <= args.years <= 100 or not 1 <= args.processes <= 8:
-        parser.error("--years is 0.0001 to 100, and --processes 1 to 8")
-    if args.share is not None:
-        return run_share(args.share, args.processes, args.years)
-    with tempfile.TemporaryDirectory(prefix="kcg-years.") as folder:
-        try:
-            for wrap in cross_in_c(library(Path(folder)), MINUTE_S):
-                print(f"crossed: {wrap.name}", flush=True)
-        except AssertionError as error:
-            print(error, file=sys.stderr)
-            return 1
-    begin = time.monotonic()
-    command = [sys.executable, __file__, f"--years={args.years}", f"--processes={args.processes}"]
-    shares = [subprocess.Popen([*command, f"--share={share}"]) for share in range(args.processes)]
-    codes = [share.wait() for share in shares]
-    print(
-        f"{args.years:g} years in {time.monotonic() - begin:.0f} s, 0 differences"
-        if not any(codes)
-        else "FAILED"
-    )
-    return int(any(codes))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
