@@ -31,6 +31,8 @@ from kontronik_can_gw.desk.monitor.status import look_at
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
+from kontronik_can_gw.runtime.files.event_recorder import EventRecorderFacts
+from kontronik_can_gw.runtime.files.recorder import RecorderFacts
 from kontronik_can_gw.runtime.status.facts import CanFacts, PortFacts, StoreFacts
 from kontronik_can_gw.runtime.status.snapshot import STALE_NS
 from kontronik_can_gw.times import SECOND
@@ -122,6 +124,14 @@ def test_values_are_in_base_units(document: dict[str, Any]) -> None:
     assert value(document, "kontronik_uptime_seconds") == 6
     assert value(document, "kontronik_esc_port_line_errors_total", esc="esc2", kind="parity") == 2
     assert value(document, "kontronik_store_failed") == 1
+
+
+def test_recorded_events_are_counted(document: dict[str, Any]) -> None:
+    name = "kontronik_recording_events_total"
+    assert value(document, name) is None
+    assert value(document | {"recording": vars(RecorderFacts())}, name) is None
+    facts = EventRecorderFacts(events=3)
+    assert value(document | {"recording": vars(facts)}, name) == 3
 
 
 def test_unavailable_value_is_left_out() -> None:

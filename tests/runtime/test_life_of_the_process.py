@@ -11,7 +11,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -261,3 +262,82 @@ def test_a_gateway_that_cannot_start_reports_only_the_reason(
     (line,) = capsys.readouterr().err.splitlines()
     assert "/dev/none: no such serial port" in line
     first.close()
+
+
+EVENTS = """
+can = {{interface = "virtual"}}
+record = {{directory = "captures", on_event = true, before_s = 1, after_s = 1, min_free_mb = 0}}
+statistics = {{file = "status.json"}}
+[[esc]]
+port = "{port}"
+telemetry_timeout_ms = 60000  # a busy machine may feed an ESC late
+"""
+
+
+@contextmanager
+def recording_gateway(folder: Path, port: str, events: bool) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a gateway with its log in the file "errors". End it with SIGTERM."""
+    text = EVENTS.format(port=port)
+    if not events:
+        text = text.replace("on_event = true, ", "")
+    config = folder / "g.toml"
+    config.write_text(text)
+    with (folder / "errors").open("w") as log:
+        process = subprocess.Popen([*PROGRAM, "run", "-c", str(config)], stderr=log)
+        try:
+            yield process
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(LIMIT_S) == 0
+        finally:
+            process.kill()
+            process.wait()
+
+
+def wait_for(condition: Callable[[], object], process: subprocess.Popen[bytes]) -> None:
+    end = time.monotonic() + LIMIT_S
+    while not condition():
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_a_signal_and_a_lost_port_are_recorded_by_the_running_program(tmp_path: Path) -> None:
+    status, log = tmp_path / "status.json", tmp_path / "errors"
+
+    def event() -> dict[str, str]:
+        document = json.loads(status.read_text()) if status.exists() else {}
+        return (document.get("recording") or {}).get("event") or {}
+
+    with feeding(tmp_path) as escs, recording_gateway(tmp_path, escs[0].path, True) as process:
+        escs[0].on = True
+        wait_for(lambda: "esc1: telemetry ok" in log.read_text(), process)
+        assert not any((tmp_path / "captures").iterdir())
+        process.send_signal(signal.SIGUSR1)
+        wait_for(lambda: event().get("file"), process)
+        assert event()["reason"] == "signal USR1"
+        first = event()["file"]
+        wait_for(lambda: json.loads(status.read_text())["recording"]["file"] == "", process)
+        Path(escs[0].path).unlink()
+        escs[0].close()
+        wait_for(lambda: event()["file"] != first, process)
+        assert (event()["esc"], event()["reason"]) == ("esc1", "telemetry lost")
+    logged = log.read_text()
+    assert f"event: signal USR1: recording to {first}" in logged
+    assert "event: esc1: telemetry lost: recording to " in logged
+    captures = sorted((tmp_path / "captures").iterdir())
+    assert len(captures) == 2
+    for capture in captures:
+        with open_input(capture) as found:
+            list(found.frames())
+            assert found.damage == []
+            assert "(" in found.provenance["recorded because of"]
+
+
+def test_signal_usr1_has_no_effect_without_recording_on_events(tmp_path: Path) -> None:
+    log = tmp_path / "errors"
+    with feeding(tmp_path) as escs, recording_gateway(tmp_path, escs[0].path, False) as process:
+        wait_for(lambda: "CAN virtual" in log.read_text(), process)
+        process.send_signal(signal.SIGUSR1)
+        escs[0].on = True
+        wait_for(lambda: "esc1: telemetry ok" in log.read_text(), process)
+    assert "stopped by SIGTERM" in log.read_text()

@@ -21,6 +21,7 @@ from kontronik_can_gw.desk.monitor.status import (
     judge,
     lines_of,
 )
+from kontronik_can_gw.runtime.files.event_recorder import EventRecorderFacts
 from kontronik_can_gw.runtime.status.facts import (
     CanFacts,
     PortFacts,
@@ -158,6 +159,24 @@ def test_each_fault_is_reported_as_a_sentence(
     seen = judged(bench.document(**facts))
     assert seen.code == (TROUBLE if said else HEALTHY)
     assert list(seen.troubles) == said
+
+
+def test_the_last_recorded_event_and_its_file_are_shown() -> None:
+    document = heard().document()
+    facts = EventRecorderFacts(ring_bytes=1_200_000)
+    document["recording"] = vars(facts)
+    shown = words(judged(document))
+    assert "recording waits for an event, with 1.2 MB in memory" in shown
+    assert "last event" not in shown
+    facts.event = {"time": "2026-11-28T21:00:00Z", "esc": "e1", "reason": "hot", "file": ""}
+    assert "last event at 2026-11-28T21:00:00Z: e1: hot, not recorded yet" in words(
+        judged(document)
+    )
+    facts.event |= {"esc": "", "file": "/captures/a.kcap"}
+    facts.file = "/captures/a.kcap"
+    shown = words(judged(document))
+    assert "recording waits" not in shown
+    assert "last event at 2026-11-28T21:00:00Z: hot, /captures/a.kcap" in shown
 
 
 def test_a_document_older_than_three_seconds_shows_no_value() -> None:
