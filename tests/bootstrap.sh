@@ -167,6 +167,10 @@ install_small_tools() {
 
 install_cpp() { install_programs "a C++ compiler" g++; }
 
+install_file_systems() {
+    install_programs "file systems after a loss of power" mkfs.ext4=e2fsprogs mkfs.f2fs=f2fs-tools mkfs.vfat=dosfstools
+}
+
 install_clang() { install_programs "a second C compiler, with a fuzzer" clang=clang,libclang-rt-dev; }
 
 install_browser() { command -v google-chrome >/dev/null || install_programs "a browser" chromium; }
@@ -212,6 +216,7 @@ case $what in
         install_small_tools
         install_cpp
         install_vm uml
+        install_file_systems
         install_browser
         install_clang
         install_programs "systemd, a broker, Prometheus" systemd-analyze=systemd mosquitto mosquitto_sub=mosquitto-clients prometheus
@@ -223,6 +228,7 @@ case $what in
         install_project test '.[test]'
         install_vcan
         install_vm uml
+        install_file_systems
         install_vm qemu
         install_clang
         install_cross_compilers

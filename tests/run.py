@@ -15,6 +15,7 @@ test-all, the slow checks and the checks with other programs:
             `test-all` as root.
   masters   tests marked "extended" on a vcan, with CANopen masters of other projects
   prove     the proofs of docs/proof.md that end within five minutes
+  cuts      200 states after a loss of power, in User Mode Linux
 
 prove, the same step alone
 
@@ -28,6 +29,7 @@ release, by hand on a quiet machine:
   fuzz      the C core under fuzzers, ten minutes each
   proofs    the proofs that need longer
   years     ten years of virtual time through the core in C (-- --years 0.1)
+  plug      10 000 states after a loss of power
   wheels    wheels for other machines
   deb       the Debian packages in fresh roots of both releases
 
@@ -76,6 +78,10 @@ ELSEWHERE = "--ignore=tests/vcan --ignore=tests/proofs"
 FUZZ_OPTIONS = "-s -o faulthandler_timeout=900"
 PROOF_OPTIONS = "-o faulthandler_timeout=3600"
 FAULTS = "python tests/faults/programme.py {0} --junit={{report}}"
+PLUG = (
+    "KCG_PLUG_STATES={0} python -m pytest -q -s -n 2 --junitxml={{report}} "
+    "-o faulthandler_timeout=18000 tests/plug/power_cuts.py {{args}}"
+)
 STEPS = {
     "lint": "ruff check . && ruff format --check .",
     "types": "mypy",
@@ -85,6 +91,8 @@ STEPS = {
     "tools": f"{PYTEST} -m 'extended or rights' {ELSEWHERE} {{args}}",
     "masters": f"{ON_VCAN} -m extended {{args}}",
     "prove": f"{PYTEST} -n 2 tests/proofs {{args}}",
+    "cuts": PLUG.format(200),
+    "plug": PLUG.format(10_000),
     "qemu": FAULTS.format("qemu"),
     "outages": FAULTS.format("uml") + " --only=Outage: --outages=20 --hangs=50",
     "soak": FAULTS.format("soak") + " --minutes=240",
@@ -100,12 +108,12 @@ STEPS = {
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
-    "test-all": (("masters", "faults"), ("tools", "prove")),
+    "test-all": (("masters", "faults"), ("tools", "prove", "cuts")),
     "prove": (("prove",),),
     "release": (
         (
-            *("qemu", "outages", "soak", "hours", "hour", "put-in"),
-            *("machines", "fuzz", "proofs", "years", "wheels", "deb"),
+            *("qemu", "outages", "soak", "hours", "hour", "put-in", "machines"),
+            *("fuzz", "proofs", "years", "plug", "wheels", "deb"),
         ),
     ),
 }
@@ -119,6 +127,8 @@ ENABLE_CROSS = (
 )
 UBUNTU_MODULES = f"linux-modules-extra-{platform.release()}"
 ENABLE_VCAN = f"{ENABLE_UML}  (or, on Ubuntu, {UBUNTU_MODULES} can-utils iproute2)"
+MAKE_FILE_SYSTEMS = "linux.uml cc mkfs.ext4 mkfs.f2fs mkfs.vfat"
+ENABLE_FILE_SYSTEMS = f"{ENABLE_UML} e2fsprogs f2fs-tools dosfstools"
 WHEELS = "aarch64-linux-gnu-gcc arm-linux-gnueabihf-gcc qemu-arm"
 ENABLE_WHEELS = "gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user"
 NEEDS = {
@@ -128,6 +138,8 @@ NEEDS = {
     "outages": ("linux.uml cc", ENABLE_UML),
     "soak": ("linux.uml cc", ENABLE_UML),
     "hours": ("linux.uml cc", ENABLE_UML),
+    "cuts": (MAKE_FILE_SYSTEMS, ENABLE_FILE_SYSTEMS),
+    "plug": (MAKE_FILE_SYSTEMS, ENABLE_FILE_SYSTEMS),
     "qemu": ("qemu-system-x86_64", "sudo tests/vm/setup.sh qemu"),
     "wheels": (WHEELS, f"sudo apt-get install {ENABLE_WHEELS}"),
     "machines": (

@@ -32,7 +32,13 @@ from kontronik_can_gw.desk.doctor.can import check_can
 from kontronik_can_gw.desk.doctor.clock import check_clock
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.desk.doctor.ports import check_port, diagnoses
-from kontronik_can_gw.desk.doctor.service import Unit, check_folder, check_service, unit_of
+from kontronik_can_gw.desk.doctor.service import (
+    Unit,
+    check_file_system,
+    check_folder,
+    check_service,
+    unit_of,
+)
 from kontronik_can_gw.desk.monitor.status import NOT_RUNNING, look_at_first, possible_files
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
@@ -170,6 +176,8 @@ def _folders(machine: Machine, findings: Findings, config: Config, unit: Unit | 
             path = folder.absolute()
             own = unit is not None and path.is_relative_to(unit.state_folder)
             check_folder(machine, findings, use, str(path), own, min_free)
+    if store is not None:
+        check_file_system(machine, findings, "stored parameters", str(store.absolute()))
 
 
 def report_lines(findings: Sequence[Finding]) -> Iterator[str]:

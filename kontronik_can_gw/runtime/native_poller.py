@@ -15,6 +15,7 @@ from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native.turns import OUTPUTS
 from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
 from kontronik_can_gw.runtime.port_input import PortInput
+from kontronik_can_gw.times import MS
 
 if TYPE_CHECKING:
     from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.can.can_link import CanLink
     from kontronik_can_gw.runtime.can.can_port import CanPort
     from kontronik_can_gw.runtime.can.transmitter import Transmitter
+
+_HANDOVER_NS = 250 * MS
+"""C hands recorded calls over after the first turn at this age. Until then, a loss of power
+loses them."""
 
 
 def poller_for(gateway: Gateway) -> Poller:
@@ -96,7 +101,7 @@ class NativePoller(Poller):
         times.polled = self.now
         times.bus_empty = self.before
         _copy_departures(can.transmitter.departures, turns.departures)
-        request.leave = leave
+        request.leave = min(leave, last + _HANDOVER_NS) if gateway.is_recorded else leave
         request.due = min(due, self._core.deadline_in_python())
         request.outputs_due = gateway.next_deadline(with_core=False)
         self._set_bus(port, period, can.transmitter)

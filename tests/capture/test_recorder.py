@@ -245,11 +245,11 @@ def test_a_blocked_disk_is_reported_and_lost_entries_are_counted(
     is_blocked = threading.Event()
     may_continue = threading.Event()
 
-    def fdatasync(_fd: int) -> None:
+    def fsync(_fd: int) -> None:
         is_blocked.set()
         assert may_continue.wait(60)
 
-    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(recorder, "PERIOD_S", 0)
     bed = Bed(tmp_path)
     assert is_blocked.wait(60)
@@ -264,6 +264,33 @@ def test_a_blocked_disk_is_reported_and_lost_entries_are_counted(
     assert len(found) == CAPACITY
     assert lost == 500
     assert begins == [False]
+
+
+def test_each_block_is_forced_to_the_disk_twice(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """f2fs may force the content with the first call, and the new size with the second one."""
+    monkeypatch.setattr(recorder, "PERIOD_S", 60)
+    bed = Bed(tmp_path)
+    bed.step(*entries(1))
+    forced = []
+    real = os.fsync
+
+    def fsync(fd: int) -> None:
+        forced.append(os.fstat(fd).st_size)
+        real(fd)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    sizes = []
+    for _ in range(2):
+        bed.step(*entries(1))
+        bed.step()
+        sizes += [bed.it._file.size] * 2 if bed.it._file else []
+    assert forced == sizes
+    assert sizes[0] < sizes[2]
+    bed.closed()
+    assert forced[4:] == [forced[-1]] * 2
 
 
 def test_no_file_is_overwritten_and_no_link_is_followed(

@@ -9,7 +9,12 @@ from doctor_trees import ROOM, Tree, grave, only
 
 from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
-from kontronik_can_gw.desk.doctor.service import check_folder, check_service, unit_of
+from kontronik_can_gw.desk.doctor.service import (
+    check_file_system,
+    check_folder,
+    check_service,
+    unit_of,
+)
 
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 STORE = "/var/lib/kontronik-can-gw"
@@ -106,6 +111,52 @@ def test_a_folder_must_be_writable_by_this_user_or_systemd(
     (found,) = findings.found
     assert found.severity == severity, found
     assert said in f"{found.text} {found.command}", found
+
+
+MOUNTS = """\
+22 1 179:2 / / rw,noatime shared:1 - ext4 /dev/root rw
+30 22 179:1 / /boot rw - vfat /dev/mmcblk0p1 rw
+31 22 8:1 / /media/my\\040stick rw - exfat /dev/sda1 rw
+32 22 0:40 / /mnt rw - tmpfs tmpfs rw
+33 22 0:41 / /mnt rw - vfat /dev/sdb1 rw
+"""
+
+
+@pytest.mark.parametrize(
+    ("folder", "kind"),
+    [
+        ("/var/lib/kontronik-can-gw", "ext4"),
+        ("/boot", "vfat"),
+        ("/boot/store", "vfat"),
+        ("/bootstrap", "ext4"),
+        ("/media/my stick/store", "exfat"),
+        ("/mnt/store", "vfat"),
+    ],
+)
+def test_parameters_on_a_file_system_without_journal_get_a_warning(
+    folder: str,
+    kind: str,
+    tree: Tree,
+) -> None:
+    tree.file("/proc/self/mountinfo", MOUNTS)
+    for name in ("/boot", "/media/my stick", "/mnt"):
+        tree.folder(name)
+    assert tree.file_system(folder) == kind
+    findings = Findings("Configuration")
+    check_file_system(tree, findings, "stored parameters", folder)
+    assert [found.severity for found in findings.found] == ["warning"] * (kind != "ext4")
+    for found in findings.found:
+        assert found.text == (
+            f"stored parameters: {folder}: a loss of power may destroy them, "
+            f"because the file system is {kind}"
+        )
+        assert found.remedy == "Choose a folder on ext4 or f2fs as canopen.store:"
+
+
+def test_a_machine_without_a_list_of_mounts_gets_no_warning(tree: Tree) -> None:
+    findings = Findings("Configuration")
+    check_file_system(tree, findings, "stored parameters", "/boot")
+    assert findings.found == []
 
 
 # --- the real machine

@@ -196,6 +196,22 @@ def test_sent_frames_equal_those_of_a_replay_in_python(
     assert (ids.count(0x98040A2A) > 20) == has_nodes
 
 
+def test_recorded_calls_reach_the_recorder_within_a_third_of_a_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After a loss of power the calls that C still holds are lost. Before 0.25 s it keeps them."""
+    it = Recorded(1, monkeypatch)
+    delays = []
+
+    def put(now: int, *_: object) -> None:
+        delays.append(it.world.now - now)
+
+    monkeypatch.setattr(it.loop.gateway, "_put", put)
+    it.run(1.9)  # the ESCs send for two seconds
+    assert len(delays) > 100
+    assert 200 * MS < max(delays) < 333 * MS
+
+
 def test_syncs_read_at_once_are_all_answered_live_and_in_a_replay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -73,6 +73,26 @@ def statistics(file: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Statisti
     made.close()
 
 
+def test_the_content_is_on_the_disk_before_it_replaces_the_old_one(
+    file: Path,
+    statistics: Statistics,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    steps = []
+    for name in ("fsync", "replace"):
+        real = getattr(os, name)
+
+        def noted(*given: object, name: str = name, real: Callable[..., object] = real) -> None:
+            steps.append(name)
+            real(*given)
+
+        monkeypatch.setattr(os, name, noted)
+    put(statistics, 1)
+    put(statistics, 2)
+    assert steps == ["fsync", "replace"] * 2
+    assert number_in(file) == 2
+
+
 def test_the_file_is_complete_readable_by_all_and_removed_at_the_end(
     file: Path,
     statistics: Statistics,

@@ -7,11 +7,12 @@ import contextlib
 import grp
 import os
 import pwd
+import re
 import stat
 import subprocess
 from collections.abc import Iterator
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import NamedTuple
 
 from kontronik_can_gw.runtime.system.clock import (
@@ -23,6 +24,14 @@ from kontronik_can_gw.runtime.system.clock import (
 
 _PATIENCE_S = 5.0
 """Longest time that a program may take."""
+
+
+_ESCAPE = re.compile(r"\\([0-7]{3})")
+"""A blank or another character in the names of /proc/self/mountinfo."""
+
+
+def _unescaped(found: re.Match[str]) -> str:
+    return chr(int(found[1], 8))
 
 
 class Process(NamedTuple):
@@ -97,6 +106,19 @@ class Machine:
         is_full = found.f_files and not found.f_favail
         free = 0 if is_full else found.f_bavail * found.f_frsize
         return bool(found.f_flag & os.ST_RDONLY), free
+
+    def file_system(self, folder: str) -> str:
+        """Return the type of the file system of a folder, such as "ext4". Empty if unknown."""
+        real = PurePath(self.real(folder))
+        found = ""
+        longest = 0
+        for line in self.text("/proc/self/mountinfo").splitlines():
+            fields, _, rest = line.partition(" - ")
+            place = PurePath(_ESCAPE.sub(_unescaped, fields.split(" ")[4]))
+            if real.is_relative_to(place) and len(place.parts) >= longest:  # the last one is on top
+                longest = len(place.parts)
+                found = rest.partition(" ")[0]
+        return found
 
     def may(self, name: str, mode: int) -> bool:
         """Return True if this process may use a file or folder in a mode of ``os.access``.

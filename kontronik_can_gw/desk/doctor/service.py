@@ -13,6 +13,8 @@ _SHOWN = "LoadState,ActiveState,SubState,UnitFileState,NRestarts,Result,User"
 _MIN_BYTES = 1_000_000
 _BOOTED = "/run/systemd/system"
 """Exists if systemd runs (sd_booted)."""
+_WITHOUT_JOURNAL = ("vfat", "msdos", "exfat")
+"""File systems in which a loss of power while a file is replaced may destroy it."""
 _UNIT_FOLDERS = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
 
 
@@ -92,9 +94,9 @@ def check_folder(
     ``what``: the use of the folder, for example "stored parameters". ``own``: systemd creates it
     for the service. ``reserve``: number of free bytes below which nothing is written to it.
     """
-    there = PurePath(folder)
-    while (status := machine.status(str(there))) is None:
-        there = there.parent
+    there = _existing(machine, folder)
+    status = machine.status(str(there))
+    assert status is not None
     read_only, free = machine.space(str(there))
     needed = max(_MIN_BYTES, reserve)
     case = "ok"
@@ -112,3 +114,18 @@ def check_folder(
     space = {"free": free // 1_000_000, "needed": needed // 1_000_000}
     names = {"what": what, "folder": folder, "there": there, "user": machine.user}
     findings.add("config.folder", case, made=made, **names, **space)
+
+
+def check_file_system(machine: Machine, findings: Findings, what: str, folder: str) -> None:
+    """Check that files of a folder can be replaced safely, so that a loss of power is harmless."""
+    kind = machine.file_system(str(_existing(machine, folder)))
+    if kind in _WITHOUT_JOURNAL:
+        findings.add("config.file_system", "unsafe", what=what, folder=folder, kind=kind)
+
+
+def _existing(machine: Machine, folder: str) -> PurePath:
+    """Return the folder, or the nearest folder above it that exists."""
+    there = PurePath(folder)
+    while not machine.exists(str(there)):
+        there = there.parent
+    return there

@@ -413,16 +413,25 @@ class CapturePart:
         if os.fstat(self._fd).st_nlink == 0:
             raise OSError(errno.ENOENT, "the file was removed while it was being written")
         if self._new:
-            os.fdatasync(self._fd)
+            self._force()
         new = self._new
         self._new = 0
         return new
+
+    def _force(self) -> None:
+        """Force content and size to the disk.
+
+        f2fs (Linux 6.1) may flush the disk before it has written the new size. A second call then
+        flushes the size, too. Otherwise the block is lost if power fails before the next one.
+        """
+        os.fsync(self._fd)
+        os.fsync(self._fd)
 
     def close(self) -> int:
         """Write the end and close. Returns the number of bytes since the last ``sync``."""
         try:
             self.write(b"E", b"")
-            os.fdatasync(self._fd)
+            self._force()
         finally:
             os.close(self._fd)
         return self._new

@@ -150,7 +150,8 @@ class Statistics:
     def _write(self, data: bytes) -> None:
         """Replace the file, so that a reader always finds the whole old or new content.
 
-        The content is not forced to the disk, because it is useless after a loss of power.
+        The content is forced to the disk first. Otherwise the file may be empty or full of zeros
+        after a loss of power.
         """
         path = self._path
         temporary = self._temporary
@@ -159,7 +160,7 @@ class Statistics:
             # os.path and os.replace are cheaper than pathlib, and this runs every second.
             if not os.path.isfile(path) and path.exists():  # noqa: PTH113
                 raise OSError(errno.EINVAL, "it is not a regular file")  # e.g. /dev/null
-            write_new(temporary, data, 0o644)
+            write_new(temporary, data, 0o644, is_synced=True)
             os.replace(temporary, path)  # noqa: PTH105
         except OSError as error:
             with contextlib.suppress(OSError):
