@@ -227,6 +227,19 @@ def test_emergencies_are_the_bits_enabled_in_the_eds(facts: Facts) -> None:
     assert of_gateway == expected
 
 
+def test_a_counter_of_an_object_restarts_after_the_number_of_its_type(facts: Facts) -> None:
+    """The limit of the DBC's signal is lower, because the signal has codes and fewer bits."""
+    rows = {row["object"]: row for row in facts["objects"]}
+    for place in ("2001h:04", "2020h:07", "2021h:03"):
+        assert rows[place]["meaning"].endswith(
+            "It restarts at 0 after the highest number of its type."
+        )
+    for row in (*facts["objects"], *facts["values"]):
+        assert "65533" not in row["meaning"], row
+    signals = {row["signal"]: row["meaning"] for row in facts["signals"]}
+    assert "It restarts at 0 after 65533." in signals["CrcErrors"]
+
+
 def test_each_value_has_a_meaning_and_its_objects(facts: Facts) -> None:
     told = {row["name"]: row for row in facts["values"]}
     assert {name for name, row in told.items() if not row["only_objects"]} == set(VALUES)

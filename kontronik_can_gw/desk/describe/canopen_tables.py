@@ -90,6 +90,11 @@ def _pdos(nodes: Sequence[tuple[str, Node]]) -> Iterator[Row]:
             }
 
 
+_RESTARTS = "It restarts at 0 after the highest number of its type."
+_LONG_AGE = "65534 means this age or more, and 65535 that nothing has arrived yet."
+_NOTES = {"data_age": _LONG_AGE, "info_age": _LONG_AGE}
+
+
 def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
     """Return the row of an entry.
 
@@ -107,11 +112,13 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
     step = None
     unit = ""
     shows = ""
+    note = ""
     if bound is not None:
         default = None
         step = number(1 / bound.steps)
         unit = bound.source.unit
         shows = bound.source.name
+        note = _RESTARTS if bound.source.rolls else _NOTES.get(shows, "")
     return {
         "object": entry.place,
         "name": name,
@@ -125,7 +132,7 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
         "step": step,
         "unit": unit,
         "shows": shows,
-        "meaning": meanings.get(shows, ""),
+        "meaning": " ".join(filter(None, (meanings.get(shows, ""), note))),
     }
 
 

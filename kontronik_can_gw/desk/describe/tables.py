@@ -6,6 +6,7 @@ A physical value is raw * factor + offset.
 """
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from fractions import Fraction
@@ -416,11 +417,17 @@ def protocols_of(escs: Sequence[EscSettings]) -> list[EscProtocol]:
     return list(dict.fromkeys(protocol_named(esc.protocol) for esc in escs))
 
 
+_LIMITS = re.compile(
+    r" (It restarts at 0 after \d+|NotAvailable before the first frame, Error [^.]*)\."
+)
+"""Sentences of a comment that hold for the signal, but not for an object with more bits."""
+
+
 def meanings_of(escs: Sequence[EscSettings]) -> dict[str, str]:
     """Return the meaning of each value by name.
 
     For a flag it is the meaning of its bit. For other values it is the comment of the signal of the
-    shipped DBC that is bound to it.
+    shipped DBC that is bound to it, without the limits of this signal.
     """
     shipped_dbc = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
     found = {}
@@ -429,7 +436,7 @@ def meanings_of(escs: Sequence[EscSettings]) -> dict[str, str]:
         for signal in plan.signals:
             if signal.source is not None:
                 comment = message.get_signal_by_name(signal.name).comment
-                found[signal.source.name] = _line(comment)
+                found[signal.source.name] = _LIMITS.sub("", _line(comment))
     for protocol in protocols_of(escs):
         for bit in protocol.bits.values():
             found[bit.text] = bit.meaning
