@@ -92,7 +92,8 @@ def test_a_flight_with_two_faults_gives_two_captures_equal_to_the_flight(tmp_pat
         (captures[1], second, "e1: telemetry lost"),
     ):
         frames, found = replayed(path)
-        begin, end = event_ns - 5 * SECOND, event_ns + 4 * SECOND
+        begin = event_ns - 5 * SECOND
+        end = event_ns + 4 * SECOND
         live = flight.sent(begin, end)
         assert len(live) > 3000
         assert between(frames, begin, end) == live
@@ -130,7 +131,8 @@ def test_an_event_soon_after_a_capture_has_its_seconds_before_it_too(tmp_path: P
     flight.it.close()
     _, path = flight.captures()
     frames, _ = replayed(path)
-    begin, end = second - 5 * SECOND, second + 1 * SECOND
+    begin = second - 5 * SECOND
+    end = second + 1 * SECOND
     assert between(frames, begin, end) == flight.sent(begin, end)
 
 
@@ -153,7 +155,8 @@ def test_a_capture_on_an_event_has_parts(tmp_path: Path) -> None:
     files = flight.captures()
     assert [path.stem.rpartition("-")[2] for path in files] == ["00000", "00001", "00002"]
     frames, found = replayed(tmp_path)
-    begin, end = event - 5 * SECOND, event + 150 * SECOND
+    begin = event - 5 * SECOND
+    end = event + 150 * SECOND
     assert between(frames, begin, end) == flight.sent(begin, end)
     assert "undervoltage" in found.provenance["recorded because of"]
 
@@ -184,7 +187,8 @@ def test_an_event_while_the_folder_is_unusable_is_recorded_later(tmp_path: Path)
     flight.it.close()
     assert flight.it.facts.problem == ""
     frames, _ = replayed(flight.captures()[0])
-    begin, end = event - 5 * SECOND, event + 3 * SECOND
+    begin = event - 5 * SECOND
+    end = event + 3 * SECOND
     assert between(frames, begin, end) == flight.sent(begin, end)
 
 
@@ -212,7 +216,8 @@ def test_a_disk_that_fails_during_a_capture_begins_a_new_one(
     assert path.stat().st_size > 10_000
     frames, _ = replayed(path)
     assert frames[0].time_ns < event
-    settled, end = frames[0].time_ns + 12 * SECOND, event + 20 * SECOND
+    settled = frames[0].time_ns + 12 * SECOND
+    end = event + 20 * SECOND
     assert len(between(frames, settled, end)) > 1000
     assert between(frames, settled, end) == flight.sent(settled, end)
     assert flight.it.facts.lost == 0

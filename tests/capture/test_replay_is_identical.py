@@ -108,7 +108,8 @@ def test_messages_of_a_later_part_alone_are_exact_once_it_has_settled(
     bench = Bench(*made(2))
     run = bench.running(seed, wild=is_wild)
     begin = now = run(7.3)
-    first_entry, first_frame = len(bench.entries), len(bench.sent)
+    first_entry = len(bench.entries)
+    first_frame = len(bench.sent)
     state = state_of(bench.gateway)
     for _ in range(12):
         data = json_payload(state_of(bench.gateway))

@@ -302,7 +302,8 @@ def wait_for(condition: Callable[[], object], process: subprocess.Popen[bytes]) 
 
 
 def test_a_signal_and_a_lost_port_are_recorded_by_the_running_program(tmp_path: Path) -> None:
-    status, log = tmp_path / "status.json", tmp_path / "errors"
+    status = tmp_path / "status.json"
+    log = tmp_path / "errors"
 
     def event() -> dict[str, str]:
         document = json.loads(status.read_text()) if status.exists() else {}
