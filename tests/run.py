@@ -79,7 +79,7 @@ FUZZ_OPTIONS = "-s -o faulthandler_timeout=900"
 PROOF_OPTIONS = "-o faulthandler_timeout=3600"
 FAULTS = "python tests/faults/programme.py {0} --junit={{report}}"
 PLUG = (
-    "KCG_PLUG_STATES={0} python -m pytest -q -s -n 2 --junitxml={{report}} "
+    "KCG_PLUG_STATES={0} python -m pytest -q -s --junitxml={{report}} "
     "-o faulthandler_timeout=18000 tests/plug/power_cuts.py {{args}}"
 )
 STEPS = {

@@ -20,7 +20,10 @@ from typing import NamedTuple
 
 SECTOR = 512
 _HEAD = struct.Struct("<QQQQ")
-_FLUSH, _FUA, _DISCARD, _MARK = 1, 2, 4, 8
+_FLUSH = 1
+_FUA = 2
+_DISCARD = 4
+_MARK = 8
 
 
 class Entry(NamedTuple):

@@ -19,7 +19,11 @@ _LOOP_SET_FD = 0x4C00
 _LOOP_CLR_FD = 0x4C01
 _DM = struct.Struct("=3I2IIiIIIQ128s129s7x")
 _DM_TARGET = struct.Struct("=QQiI16s")
-_DM_CREATE, _DM_REMOVE, _DM_SUSPEND, _DM_LOAD, _DM_MESSAGE = 3, 4, 6, 9, 14
+_DM_CREATE = 3
+_DM_REMOVE = 4
+_DM_SUSPEND = 6
+_DM_LOAD = 9
+_DM_MESSAGE = 14
 _DM_VERSION = (4, 0, 0)
 _DM_UNUSED = (0, 0, 0, 0, 0)
 """Number of users, flags, event, padding and device, which the kernel returns."""
