@@ -12,7 +12,7 @@ import pytest
 from fault_report import FAILED, FAULTS, GOOD, PAGE, Report, Row, in_order, put, shown
 from harness import Bench
 from memory_slope import HOUR_S, Sample, faults_in, slope_kib_per_hour
-from programme import PROJECT, conclude
+from programme import PROJECT, conclude, main
 from qemu_adapter import SerialAdapter
 
 
@@ -155,3 +155,16 @@ def test_memory_is_judged_by_its_slope(kib_per_hour: float, hours: float, is_goo
 def test_the_slope_of_few_samples_is_zero() -> None:
     assert slope_kib_per_hour([]) == slope_kib_per_hour([Sample(1, 2)]) == 0
     assert faults_in([]) == []
+
+
+@pytest.mark.parametrize("hours", ["0", "-1", "1e9", "nan"])
+def test_hours_out_of_range_are_refused_in_one_line(
+    hours: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["programme.py", "hours", f"--hours={hours}"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert "error: --hours is 0.1 to 1000" in capsys.readouterr().err

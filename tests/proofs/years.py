@@ -185,7 +185,9 @@ def library(folder: Path) -> Any:
     path = built(folder / "years.so", *options)
     found = load(path)
     together = c.CDLL(str(path))
-    pointer, number, time_ns = c.c_void_p, c.c_uint64, c.c_int64
+    pointer = c.c_void_p
+    number = c.c_uint64
+    time_ns = c.c_int64
     functions = {
         "make": (c.c_int,),
         "size": (c.c_size_t,),
