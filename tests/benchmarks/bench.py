@@ -15,6 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
+import busy  # noqa: E402
 import live  # noqa: E402
 import offline  # noqa: E402
 from programs import Context, Figure, LeftOut  # noqa: E402
@@ -25,6 +26,7 @@ BENCHMARKS = {
     "many": live.many,
     "delay": live.delay,
     "delay-full": live.delay_full,
+    "delay-busy": busy.delay_busy,
     "offline-capture": offline.captures,
     "offline-log": offline.can_logs,
     "offline-bytes": offline.plain_bytes,
@@ -48,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
     option = parser.add_argument
     option("--only", nargs="+", default=["*"], metavar="NAME", help="these alone; as 'cpu*' too")
     option("--list", action="store_true", help="list the benchmarks and end")
-    option("--seconds", type=seconds, default=5.0, metavar="N", help="of one measurement (5)")
+    option("--seconds", type=seconds, metavar="N", help="of one measurement (5, delay-busy 600)")
     option("--quick", action="store_true", help="as short as it can be: tries the benchmarks")
     args = parser.parse_args(arguments)
     if args.list:
@@ -61,9 +63,12 @@ def main(arguments: list[str] | None = None) -> int:
             return 2
     FOLDER.mkdir(parents=True, exist_ok=True)
     if args.quick:
-        context = Context(FOLDER, seconds=min(args.seconds, 0.5), rounds=1, quick=True)
+        short = min(args.seconds or 0.5, 0.5)
+        context = Context(FOLDER, seconds=short, long_seconds=short, rounds=1, quick=True)
+    elif args.seconds:
+        context = Context(FOLDER, seconds=args.seconds, long_seconds=args.seconds)
     else:
-        context = Context(FOLDER, seconds=args.seconds, rounds=3)
+        context = Context(FOLDER)
     results: dict[str, list[Figure] | str] = {}
     for name, function in BENCHMARKS.items():
         if any(fnmatch.fnmatch(name, one) for one in args.only):

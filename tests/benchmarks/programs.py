@@ -66,6 +66,8 @@ class Context:
     folder: Path
     seconds: float = 5.0
     """Duration of one measurement."""
+    long_seconds: float = 600.0
+    """Duration of a measurement that looks for a rare delay."""
     rounds: int = 3
     """Number of measurements of each program, which are made by turns."""
     quick: bool = False

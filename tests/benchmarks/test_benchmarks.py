@@ -4,6 +4,7 @@ from pathlib import Path
 
 import bench
 import pytest
+from busy import paused
 from programs import Context, Figure, LeftOut
 
 
@@ -49,3 +50,21 @@ def test_only_a_failed_benchmark_is_an_error(
     assert bench.main([]) == code
     assert said in capsys.readouterr().out
     assert bench.main(["--only", "cqu"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("pauses", "total"),
+    [
+        ([], 0),
+        ([(0, 100)], 0),
+        ([(50, 150)], 50),
+        ([(150, 160), (170, 300)], 40),
+        ([(120, 140), (110, 130)], 30),
+        ([(0, 500), (120, 140)], 100),
+    ],
+)
+def test_pauses_of_both_cpus_are_counted_once_within_a_delay(
+    pauses: list[tuple[int, int]],
+    total: int,
+) -> None:
+    assert paused((100, 200), pauses) == total

@@ -8,7 +8,8 @@
    1. {"ports": [...]} at the start,
    2. {"begin": number of UART frames of live data} after the gateway's first frame and the warm-up,
    3. {"end": ...} with the same number at the end,
-   4. the results.
+   4. the results. "late" has the begin and the end of each delay above 1 ms, in ns of
+      CLOCK_MONOTONIC, and stays incomplete if there are more than MOST_LATE of them.
 
    Every CAN frame with an id of five.dbc is compared with the UART frames written, in their order.
    The delay is the time from the write of the last byte of a UART frame to the receipt of its fifth
@@ -63,6 +64,9 @@ static _Atomic int64_t received;
 static _Atomic int measuring;
 static uint32_t histogram[BUCKETS + 1]; /* microseconds */
 static int64_t delay_max;
+enum { LATE_NS = 1000000, MOST_LATE = 20000 };
+static struct { int64_t begin, end; } late[MOST_LATE];
+static int late_count;
 static uint32_t sdo_histogram[BUCKETS + 1];
 static int64_t sdo_sent, sdo_answers, sdo_max;
 static _Atomic int64_t sdo_at[MOST];
@@ -195,9 +199,14 @@ static void step(struct esc *e)
     write_all(e, e->frame, e->length);
 }
 
-static void note_delay(int64_t delay)
+static void note_delay(int64_t begin, int64_t end)
 {
-    int64_t us = delay / 1000;
+    int64_t delay = end - begin, us = delay / 1000;
+    if (delay > LATE_NS && late_count < MOST_LATE) {
+        late[late_count].begin = begin;
+        late[late_count].end = end;
+        late_count++;
+    }
     histogram[us > BUCKETS ? BUCKETS : us]++;
     if (delay > delay_max)
         delay_max = delay;
@@ -234,7 +243,7 @@ static void receive(const struct can_frame *frame, int64_t now)
         e->next[slot] = k + 1;
         e->matched[slot]++;
         if (++w->got == FIVE && w->measured)
-            note_delay(now - w->at);
+            note_delay(w->at, now);
         return;
     }
 }
@@ -445,7 +454,11 @@ int main(int argc, char **argv)
     percentiles("delay_us", histogram, delay_max);
     printf(", ");
     percentiles("sdo_us", sdo_histogram, sdo_max);
-    printf(", \"sdo_sent\": %lld, \"sdo_answers\": %lld}\n", (long long)sdo_sent, (long long)sdo_answers);
+    printf(", \"late\": [");
+    for (int i = 0; i < late_count; i++)
+        printf("%s[%lld, %lld]", i ? ", " : "", (long long)late[i].begin, (long long)late[i].end);
+    printf("], \"sdo_sent\": %lld, ", (long long)sdo_sent);
+    printf("\"sdo_answers\": %lld}\n", (long long)sdo_answers);
     fflush(stdout);
     _exit(0);
 }
