@@ -37,8 +37,14 @@ _LATER_OF_ESC = ("late_frames", "suspect_frames", "line_errors")
 """Counters that captures before 0.6 do not have."""
 _WINDOW = ("window_ns", "live", "dropped_bytes", "bytes", "crc_errors", "rate", "interval_ns")
 """Parts of ``EscTelemetry.window``."""
-_MAX_PLACE = 0xFFFF
-"""Limit of alive counters and pages."""
+_LIMITS_OF_PLACE = (
+    (0, 0xFFFF),
+    (0, 0xFF),
+    (-1, END_OF_TIME - 1),
+    (-1, END_OF_TIME - 1),
+    (0, 1),
+)
+"""Limits of the numbers of ``core.interface.Place``."""
 _MAX_HELD = 0xFF
 """Limit of the bytes that a decoder holds."""
 _LIMITS_OF_GATEWAY = {
@@ -59,9 +65,9 @@ def check_state(state: Mapping[str, Any]) -> None:
         if "counters" in esc:
             whole_number(esc["held"], 0, _MAX_HELD)
             _check_stream(esc["counters"], esc["window"])
-    for alive, place in state.get("messages", ()):
-        whole_number(alive, 0, _MAX_PLACE)
-        whole_number(place, 0, _MAX_PLACE)
+    for place in state.get("messages", ()):
+        for number, (low, high) in zip(place, _LIMITS_OF_PLACE, strict=True):
+            whole_number(number, low, high)
     if "counters" in state:
         check_counters([whole_number(each, 0, END_OF_TIME) for each in state["counters"]])
     for name, high in _LIMITS_OF_GATEWAY.items():

@@ -27,6 +27,20 @@ class Follower(NamedTuple):
     on_event: OnEvent
 
 
+class Place(NamedTuple):
+    """The state of a message that a replay cannot compute if it begins later. Times are in ns."""
+
+    alive: int
+    page: int
+    """Index of the next page."""
+    sent_ns: int
+    """Time of the last frame. -1: none was sent."""
+    deferred_until: int
+    """Time until which the next frame is deferred. -1: it is not."""
+    cycle_deferred: int
+    """1 if the deferred frame is the one of a cycle."""
+
+
 class Core(Protocol):
     """All that the gateway uses of a core. Calls must be in the order of their times."""
 
@@ -82,11 +96,11 @@ class Core(Protocol):
 
     # --- a replay that begins later in a run
 
-    def places(self) -> list[tuple[int, int]]:
-        """Return alive counter and index of the next page of each message."""
+    def places(self) -> list[Place]:
+        """Return the place of each message in its schedule."""
 
     def adopt_places(self, places: Sequence[Sequence[int]]) -> None:
-        """Continue with the alive counters and pages of ``places``.
+        """Continue from these places.
 
         Call it also after the windows of ESCs were set, because deadlines change with them.
         """

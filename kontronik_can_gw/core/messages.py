@@ -9,6 +9,7 @@ message is always kept.
 
 from collections.abc import Sequence
 
+from kontronik_can_gw.core.interface import Place
 from kontronik_can_gw.core.output import Owner
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
@@ -153,6 +154,26 @@ class _Message(Traits):
             self._cycle_deferred = True
         return when, why
 
+    def schedule_place(self) -> Place:
+        """Return its place in the schedule."""
+        deferred_until = -1 if self._deferred_until == NEVER else self._deferred_until
+        return Place(
+            self.alive,
+            self.place,
+            max(-1, self._sent_ns),
+            deferred_until,
+            int(self._cycle_deferred),
+        )
+
+    def adopt(self, place: Place) -> None:
+        """Continue from this place."""
+        self.alive = place.alive % max(1, self.alive_modulus)
+        self.place = place.page % len(self.plan.pages)
+        if place.sent_ns >= 0:
+            self._sent_ns = place.sent_ns
+        self._deferred_until = NEVER if place.deferred_until < 0 else place.deferred_until
+        self._cycle_deferred = bool(place.cycle_deferred)
+
     def follows(self, events: int, up: bool) -> bool:
         """Return True if the message is sent for these events of an ESC.
 
@@ -243,15 +264,14 @@ class Messages:
 
     # --- a replay that begins later in a run
 
-    def places(self) -> list[tuple[int, int]]:
-        """Return alive counter and index of the next page of each message."""
-        return [(message.alive, message.place) for message in self._messages]
+    def places(self) -> list[Place]:
+        """Return the place of each message in its schedule."""
+        return [message.schedule_place() for message in self._messages]
 
     def adopt_places(self, places: Sequence[Sequence[int]]) -> None:
-        """Continue with the alive counters and pages of ``places``."""
-        for message, (alive, place) in zip(self._messages, places, strict=False):
-            message.alive = alive % max(1, message.alive_modulus)
-            message.place = place % len(message.plan.pages)
+        """Continue from these places."""
+        for message, place in zip(self._messages, places, strict=False):
+            message.adopt(Place(*place))
 
     # --- what makes messages pending
 

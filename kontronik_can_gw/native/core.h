@@ -348,7 +348,7 @@ typedef struct {
    offline.c passes on frames from one core to another (`found`, `read_...`, kcg_esc.count), and
    native/state.py restores sums and counters when a replay begins later in a run
    (`energy`, `energy_rest`, `run_time`, `count`, `window`, `window_ns`, `rate` and `interval` of
-   kcg_esc, `alive` and `page` of kcg_sending), and then sets `next_expiry` to 0. */
+   kcg_esc, the state in kcg_sending), and then sets `next_expiry` to 0 and sorts `heap`. */
 typedef struct {
     const kcg_plan *plan;
     kcg_esc *esc;

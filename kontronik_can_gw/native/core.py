@@ -94,9 +94,9 @@ class NativeCore:
         for settings, state in zip(escs, self.esc_states, strict=True):
             self.escs.append(NativeEsc(settings, state))
         self.own_ids: dict[int, Owner] = own_ids(layout)
-        sending = self.sending[: self.plan.messages]
-        self.places = partial(places_of, sending)
-        self.adopt_places = partial(adopt_places, self.messages, sending, self.state)
+        messages = self.messages[: self.plan.messages]
+        self.places = partial(places_of, self.sending[: self.plan.messages])
+        self.adopt_places = partial(adopt_places, messages, self.sending, self.state, self._heap)
         self._slots = Slots(self.escs, self.status)
         self._followers: Sequence[Follower] = ()
         self.choose_events()
@@ -133,6 +133,7 @@ class NativeCore:
         self.esc_states = _part(memory, _Esc, escs, state.esc)
         self.sending = _part(memory, _Sending, count, state.sending)
         self.pending = _part(memory, c.c_uint16, count, state.pending)
+        self._heap = _part(memory, c.c_uint16, count, state.heap)
         self._frames = (Frame * _MAX_FRAMES)()
         self._raw = memoryview(self._frames).cast("B")
 

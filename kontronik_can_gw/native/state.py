@@ -7,6 +7,7 @@ from dataclasses import astuple
 from functools import cache
 from typing import Any, Self
 
+from kontronik_can_gw.core.interface import Place
 from kontronik_can_gw.esc.decoder import Counters, Data, EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, LinkState
@@ -14,6 +15,8 @@ from kontronik_can_gw.native.rows import COUNTS, GATEWAY
 from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import SECOND
 
+_NEVER = (1 << 63) - 1
+"""KCG_NEVER."""
 _STREAM = COUNTS.index("longer_crcs") + 1
 """Number of entries in kcg_esc.count that count the stream. They are at the beginning."""
 _LIVE, _INFO, _LAST_LIVE, _LAST_INFO = range(4)
@@ -187,22 +190,38 @@ class NativeStatus(c.Structure):
         return NativeStatus.from_buffer_copy(self)
 
 
-def places_of(sending: Sequence[Any]) -> list[tuple[int, int]]:
-    """Return alive counter and index of the next page of messages (kcg_sending)."""
-    return [(each.alive, each.page) for each in sending]
+def places_of(sending: Sequence[Any]) -> list[Place]:
+    """Return the places of messages in their schedule (kcg_sending)."""
+    found = []
+    for each in sending:
+        deferred_until = -1 if each.deferred == _NEVER else each.deferred
+        sent_ns = max(-1, each.last)
+        found.append(Place(each.alive, each.page, sent_ns, deferred_until, each.cycle_deferred))
+    return found
 
 
 def adopt_places(
     messages: Sequence[Any],
-    sending: Sequence[Any],
+    sending: Any,
     core: Any,
+    heap: Any,
     places: Sequence[Sequence[int]],
 ) -> None:
-    """Continue with the alive counters and pages of ``places_of``.
+    """Continue from the places of the first messages, and compute the core's deadlines again.
 
-    The deadlines of the core (kcg) are computed again.
+    ``sending`` and ``heap`` belong to all messages and slots of the core (kcg).
     """
-    for message, each, (alive, place) in zip(messages, sending, places, strict=False):
-        each.alive = alive % (message.last_alive + 1)
-        each.page = place % max(1, message.pages)
+    for message, each, numbers in zip(messages, sending, places, strict=False):
+        place = Place(*numbers)
+        each.alive = place.alive % (message.last_alive + 1)
+        each.page = place.page % max(1, message.pages)
+        if place.sent_ns >= 0:
+            each.last = place.sent_ns
+        each.deferred = _NEVER if place.deferred_until < 0 else place.deferred_until
+        each.cycle_deferred = place.cycle_deferred
     core.next_expiry = 0
+    heaped = heap[: core.heaped]
+    in_order = sorted(heaped, key=lambda i: min(sending[i].cycle_due, sending[i].deferred))
+    for number, index in enumerate(in_order):  # a sorted list is a heap
+        heap[number] = index
+        sending[index].place_in_heap = number

@@ -76,11 +76,22 @@ def test_an_impossible_state_of_a_stream_is_refused(bad: dict[str, Any]) -> None
         check_state(with_stream(STREAM | bad))
 
 
-@pytest.mark.parametrize("key", ["messages", "counters"])
-def test_impossible_counters_of_messages_and_gateway_are_refused(key: str) -> None:
-    check_state(GOOD | {"messages": [[3, 0]], "counters": [1] * len(COUNTERS)})
+@pytest.mark.parametrize(
+    ("key", "bad"),
+    [
+        ("messages", [[1 << 16, 0, 0, -1, 0]]),
+        ("messages", [[0, 256, 0, -1, 0]]),
+        ("messages", [[0, 0, END_OF_TIME, -1, 0]]),
+        ("messages", [[0, 0, 0, -2, 0]]),
+        ("messages", [[0, 0, 0, -1, 2]]),
+        ("messages", [[0, 0]]),
+        ("counters", [-1] * len(COUNTERS)),
+    ],
+)
+def test_impossible_counters_of_messages_and_gateway_are_refused(key: str, bad: object) -> None:
+    check_state(GOOD | {"messages": [[3, 0, START, -1, 0]], "counters": [1] * len(COUNTERS)})
     with pytest.raises(ValueError):
-        check_state(GOOD | {key: [[1 << 16, 0]] if key == "messages" else [-1] * len(COUNTERS)})
+        check_state(GOOD | {key: bad})
 
 
 @pytest.mark.parametrize("pure", [False, True])
@@ -94,7 +105,7 @@ def test_a_hostile_state_cannot_leave_the_ranges_of_the_core(
     stream = {"counters": [0] * 14, "held": 255, "window": [0, 9, 9, 9, 9, 7, END_OF_TIME - 1]}
     state = GOOD | {
         "escs": [GOOD["escs"][0] | stream],  # type: ignore[index]
-        "messages": [[0xFFFF, 0xFFFF]] * 100,
+        "messages": [[0xFFFF, 0xFF, 0, END_OF_TIME - 1, 1]] * 100,
         "counters": [1] * len(COUNTERS),
     }
     check_state(state)
