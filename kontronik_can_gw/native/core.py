@@ -94,9 +94,11 @@ class NativeCore:
         for settings, state in zip(escs, self.esc_states, strict=True):
             self.escs.append(NativeEsc(settings, state))
         self.own_ids: dict[int, Owner] = own_ids(layout)
-        messages = self.messages[: self.plan.messages]
-        self.places = partial(places_of, self.sending[: self.plan.messages])
-        self.adopt_places = partial(adopt_places, messages, self.sending, self.state, self._heap)
+        count = self.plan.messages
+        self.places = partial(places_of, self.sending, count)
+        self.adopt_places = partial(
+            adopt_places, self.messages, self.sending, self.state, self._heap, count
+        )
         self._slots = Slots(self.escs, self.status)
         self._followers: Sequence[Follower] = ()
         self.choose_events()

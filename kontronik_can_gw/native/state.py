@@ -190,10 +190,10 @@ class NativeStatus(c.Structure):
         return NativeStatus.from_buffer_copy(self)
 
 
-def places_of(sending: Sequence[Any]) -> list[Place]:
-    """Return the places of messages in their schedule (kcg_sending)."""
+def places_of(sending: Any, count: int) -> list[Place]:
+    """Return the places of the first messages in their schedule (kcg_sending)."""
     found = []
-    for each in sending:
+    for each in sending[:count]:
         deferred_until = -1 if each.deferred == _NEVER else each.deferred
         sent_ns = max(-1, each.last)
         found.append(Place(each.alive, each.page, sent_ns, deferred_until, each.cycle_deferred))
@@ -205,13 +205,14 @@ def adopt_places(
     sending: Any,
     core: Any,
     heap: Any,
+    count: int,
     places: Sequence[Sequence[int]],
 ) -> None:
-    """Continue from the places of the first messages, and compute the core's deadlines again.
+    """Continue from the places of the first ``count`` messages, and compute deadlines again.
 
     ``sending`` and ``heap`` belong to all messages and slots of the core (kcg).
     """
-    for message, each, numbers in zip(messages, sending, places, strict=False):
+    for message, each, numbers in zip(messages, sending, places[:count], strict=False):
         place = Place(*numbers)
         each.alive = place.alive % (message.last_alive + 1)
         each.page = place.page % max(1, message.pages)
