@@ -49,7 +49,12 @@ class Plan:
     """Sizes of a plan on which the limits depend."""
 
     messages: int
+    pages: int
     escs: int
+    listeners: int
+    """The most messages that follow events of an ESC."""
+    of_the_gateway: int
+    """Messages with values of the gateway."""
     signals: int
     pairs: int
     """Entries of the tables of all signals."""
@@ -61,6 +66,8 @@ class Plan:
     """Signals of the messages that are compared with their last frame when they are requested."""
     divisions: int
     """The most divisions that packing all signals needs."""
+    news_divisions: int
+    """The same for the signals of `news`."""
 
 
 def plan_of(dbc: Path) -> Plan:
@@ -68,15 +75,24 @@ def plan_of(dbc: Path) -> Plan:
     tables = Tables(bus.layout, bus.escs, False)
     on_change = [row for row in tables.messages if row.flags & KCG.ON_CHANGE]
     news = [row for row in on_change if not row.flags & KCG.EVENT]
+    news_signals = [
+        tables.signals[number]
+        for row in news
+        for number in range(row.first_signal, row.first_signal + row.signals)
+    ]
     return Plan(
         messages=len(tables.messages),
+        pages=sum(row.pages for row in tables.messages),
         escs=len(bus.escs),
+        listeners=max(map(len, tables.listeners_of)),
+        of_the_gateway=sum(bool(row.flags & KCG.OF_THE_GATEWAY) for row in tables.messages),
         signals=len(tables.signals),
         pairs=sum(row.pairs for row in tables.signals),
         pieces=max(row.pieces for row in tables.signals),
         on_change=sum(row.signals + 1 for row in on_change),
         news=sum(row.signals + 1 for row in news),
         divisions=sum(map(divisions_of, tables.signals)),
+        news_divisions=sum(map(divisions_of, news_signals)),
     )
 
 
@@ -95,6 +111,7 @@ SHARED_CALLS = {
     for called in ("__aeabi_ldivmod", "__aeabi_uldivmod")
 }
 SHARED_CALLS["kcg_next_event", "report"] = "report"  # the state of the link
+SHARED_CALLS["kcg_gateway_changed", "request"] = "gateway"
 SHARED = {
     "for (; n; p++, n--) {": "crc",
     "for (size_t i = from; i < to; i++) {": "drop",
@@ -133,8 +150,11 @@ def limits_of(plan: Plan) -> dict[str, int]:
         "for (;;) {": depth,
         # messages
         "for (uint32_t i = 0; i < g->plan->messages; i++) {": plan.messages,
+        "for (uint32_t i = 0; i < g->plan->messages; i++)": plan.messages,
+        "for (uint32_t k = 0; k < g->pendings; k++)": plan.messages,
+        "for (uint32_t k = 0; k < g->plan->pages; k++)": plan.pages,
         "for (int k = plan->first_listener[esc]; k < plan->first_listener[esc + 1]; k++) {": (
-            plan.messages
+            plan.listeners
         ),
         "for (int i = 0; i < g->plan->escs; i++)": plan.escs,
         "for (int i = 0; i < g->plan->escs; i++) {": plan.escs,
@@ -169,11 +189,17 @@ class Limits:
         unused = {*self.costs.limits, *SHARED} - self.costs.used
         assert not unused, f"no loop has this source text: {sorted(unused)}"
 
-    def _sum(self, own: int, packs: int, **passes: int) -> int:
-        """Add the passes of the shared loops. `packs`: how often all signals are packed."""
+    def _sum(self, own: int, packs: int = 0, reports: int = 0, **passes: int) -> int:
+        """Add the passes of the shared loops.
+
+        packs: how often all signals are packed. reports: how often events request messages, which
+        includes kcg_gateway_changed once for each.
+        """
         plan = self.plan
-        passes["division"] = packs * plan.divisions
-        passes["pair"] = packs * (plan.pairs + plan.signals)
+        passes["pack"] = passes.get("pack", 0) + reports * plan.news
+        passes["division"] = packs * plan.divisions + reports * plan.news_divisions
+        passes["pair"] = (packs + reports) * (plan.pairs + plan.signals)
+        passes["gateway"] = reports * plan.of_the_gateway
         return own + sum(count * self.costs.passes[name] for name, count in passes.items())
 
     def receive(self, size: int, most_frames: int = MOST_BYTES) -> int:
@@ -185,9 +211,6 @@ class Limits:
         frames = min(most_frames, scanned // SHORTEST)
         headers = sum(max(0, bytes_ - SHORTEST) // HEADER + 1 for bytes_ in scans)
         turns = sum(bytes_ // (HEADER - 1) + 2 for bytes_ in scans)
-        # Messages are requested by expired values of each ESC, by each frame, by the state of the
-        # link, and by the second of the gateway.
-        reports = self.plan.escs + frames + 2
         return self._sum(
             self._own["receive"],
             scan=turns,
@@ -197,15 +220,14 @@ class Limits:
             header_at=scanned + turns,
             accept=frames + 2,
             report=1,
-            packs=reports,
-            pack=reports * self.plan.news,
+            # expired values of each ESC, each frame, the state of the link, the gateway's second
+            reports=self.plan.escs + frames + 2,
         )
 
     def advance(self) -> int:
-        reports = self.plan.escs + 1
-        return self._sum(
-            self._own["advance"], accept=1, report=1, packs=reports, pack=reports * self.plan.news
-        )
+        # expired values of each ESC, the gateway's second, the beginning and the end of quiet mode
+        reports = self.plan.escs + 3
+        return self._sum(self._own["advance"], accept=1, report=1, reports=reports)
 
     def take(self) -> int:
         """Return the limit of kcg_take with all messages."""
@@ -233,8 +255,7 @@ class Limits:
             header_at=scan + turns,
             accept=2,
             report=1,
-            packs=2,
-            pack=2 * self.plan.news,
+            reports=3,
         )
 
     def stated(self) -> dict[str, int]:
