@@ -153,6 +153,8 @@ class Tally:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.bad = 0
+        self.shown: list[str] = []
+        """Descriptions of the first bad states."""
         self.loss_ns = 0
 
     def add(self, kind: str, state: State, verdict: Verdict) -> None:
@@ -161,8 +163,9 @@ class Tally:
         if verdict.problems:
             self.bad += 1
             if self.bad <= SHOWN:
-                print(f"BAD {kind} {state.kind} at entry {state.at}, flushed {state.base}:")
-                print(*(f"    {each}" for each in verdict.problems), sep="\n", flush=True)
+                head = f"BAD {kind} {state.kind} at entry {state.at}, flushed {state.base}:"
+                self.shown.append("\n    ".join([head, *verdict.problems]))
+                print(self.shown[-1], flush=True)
 
     @property
     def total(self) -> int:
@@ -242,6 +245,7 @@ def main() -> int:
         "rescued": examiner.rescued,
         "undone": examiner.undone,
         "positions": len(recorded.log.positions()),
+        "shown": tally.shown,
         "loss_s": round(tally.loss_ns / 1e9, 3),
     }
     (args.folder / f"{args.system}.json").write_text(json.dumps(figures))
