@@ -55,7 +55,7 @@ def ring_bytes(config: RecordConfig, escs: int) -> int:
     return escs * seconds * _BYTES_PER_S
 
 
-class FlightEvent(NamedTuple):
+class RecordedEvent(NamedTuple):
     """An event that is recorded."""
 
     time_ns: int
@@ -222,15 +222,15 @@ class EventRecorder(Recorder):
         self.facts = EventRecorderFacts()
         self._ring = Ring(config.before_s * SECOND + _MARGIN_NS, ring_bytes(config, escs))
         self._after_ns = config.after_s * SECOND
-        self._triggers: deque[FlightEvent] = deque(maxlen=_MAX_WAITING)
+        self._triggers: deque[RecordedEvent] = deque(maxlen=_MAX_WAITING)
         self._until_ns: int | None = None
         """Time at which the capture may end. None while nothing is recorded."""
-        self._listed: list[FlightEvent] = []
+        self._listed: list[RecordedEvent] = []
         """The first events of the capture."""
         self._is_list_written = True
         self._has_next_part = False
         """True if the next part continues a capture."""
-        self._new: list[FlightEvent] = []
+        self._new: list[RecordedEvent] = []
         """Events that were not logged yet."""
         self._lines: deque[tuple[str, str]] = deque(maxlen=_MAX_WAITING)
 
@@ -241,7 +241,7 @@ class EventRecorder(Recorder):
 
     def trigger(self, time_ns: int, wall: float, esc: str, reason: str) -> None:
         """Report an event. Never waits."""
-        self._triggers.append(FlightEvent(time_ns, wall, esc, reason))
+        self._triggers.append(RecordedEvent(time_ns, wall, esc, reason))
 
     def take_events(self) -> list[tuple[str, str]]:
         return [self._lines.popleft() for _ in range(len(self._lines))]

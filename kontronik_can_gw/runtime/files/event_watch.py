@@ -2,7 +2,7 @@
 
 The core calls ``_follow`` with each change, in both languages. So an error bit is noticed even if
 it is set in a single frame, and a limit even if a single frame crosses it. Error bits and losses
-cost nothing until they change. Conditions about live data make the core report each live frame.
+are looked at when they change. Conditions about live data make the core report each live frame.
 """
 
 import time
