@@ -87,6 +87,30 @@ def test_a_missing_unit_is_reported_once_with_the_remedy(
     assert it.gateway.status.can_restarts == 0
 
 
+def test_requests_without_an_answer_back_off(kernel: Kernel) -> None:  # noqa: F811
+    asked = Hung(kernel).run(60, restarts=False)
+    assert asked[0] == 0.5
+    pauses = [after - before for before, after in pairwise(asked)]
+    assert pauses[:2] == [4.0, 8.0]
+    assert set(pauses[2:]) == {MAX_PAUSE_NS / SECOND}
+
+
+def test_an_outage_does_not_end_while_the_gateway_holds_its_frames(
+    kernel: Kernel,  # noqa: F811
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """In quiet mode, no first frame is sent after a restart, so no frame shows that it worked."""
+    caplog.set_level(logging.INFO, "kontronik_can_gw")
+    it = Hung(kernel)
+    it.run(1, restarts=True)
+    it.gateway.hold(it.now)
+    it.restart.follow(None, it.now)
+    assert caplog.messages == ["CAN can0: no frame left it, so it is restarted"]
+    it.gateway.release(it.now)
+    it.restart.follow(None, it.now)
+    assert caplog.messages[1:] == ["CAN can0: works again after one restart"]
+
+
 @pytest.mark.parametrize(("after_s", "interface"), [(0, "socketcan"), (0.5, "virtual")])
 def test_nothing_is_requested_without_the_key_or_socketcan(
     kernel: Kernel,  # noqa: F811

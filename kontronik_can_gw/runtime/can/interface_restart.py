@@ -38,7 +38,8 @@ class InterfaceRestart:
     """Requests restarts of one interface.
 
     1. The first request of an outage follows ``can.restart_after_s`` after its begin.
-    2. If no frame leaves after a restart, the pause doubles, up to MAX_PAUSE_NS.
+    2. If no frame leaves after a restart, the pause until the next request doubles, up to
+       MAX_PAUSE_NS. It also doubles, from ANSWER_NS, if no restart follows a request.
     3. A restart is counted when the interface has gone down after a request.
     """
 
@@ -54,13 +55,16 @@ class InterfaceRestart:
         self._after_ns = 0
         if config.interface == "socketcan":
             self._after_ns = round(config.restart_after_s * SECOND)
+        self._gateway = gateway
         self._status = gateway.status
         self._conditions = conditions
         self._ask = ask
         self._pause_ns = self._after_ns
         """Pause before the next request."""
         self._requested_ns = -NEVER
-        """Time of the last request that has not been answered by a restart."""
+        """Time of the last request."""
+        self._is_pending = False
+        """True if neither a restart nor ANSWER_NS has followed the last request."""
         self._restarts = 0
         """Number of restarts since a frame has left the interface."""
 
@@ -72,32 +76,38 @@ class InterfaceRestart:
         if not self._after_ns:
             return
         if outage_since is None:
-            self._end(now)
+            if not self._gateway.is_held:
+                self._end(now)
             return
-        if self._requested_ns > 0 and now - self._requested_ns > ANSWER_NS:
-            self._requested_ns = -NEVER
+        if self._is_pending and now - self._requested_ns > ANSWER_NS:
+            self._is_pending = False
+            self._double(max(self._pause_ns, ANSWER_NS))
             text = (
                 f"CAN {self._channel}: the interface was not restarted. Enable the unit: "
                 f"sudo systemctl enable --now kontronik-can-gw-restart@{self._channel}.path"
             )
             self._conditions.begin(self.condition, text, now)
-        if now - max(outage_since, self._requested_ns) < self._pause_ns:
+        if self._is_pending or now - max(outage_since, self._requested_ns) < self._pause_ns:
             return
         self._requested_ns = now
-        self._pause_ns = min(2 * self._pause_ns, max(MAX_PAUSE_NS, self._after_ns))
+        self._is_pending = True
         self._ask(self._channel)
 
     def went_down(self, now: int) -> None:
         """Follow an interface that was set down. Counts it if a restart was requested."""
-        if now - self._requested_ns > ANSWER_NS:
+        if not self._is_pending or now - self._requested_ns > ANSWER_NS:
             return
-        self._requested_ns = -NEVER
+        self._is_pending = False
+        self._double(self._pause_ns)
         self._status.can_restarts += 1
         self._restarts += 1
         if self._restarts == 1:
             text = f"CAN {self._channel}: no frame left it, so it is restarted"
             self._conditions.event(f"{self.condition}s", text, now)
         self._conditions.forget(self.condition)
+
+    def _double(self, pause_ns: int) -> None:
+        self._pause_ns = min(2 * pause_ns, max(MAX_PAUSE_NS, self._after_ns))
 
     def _end(self, now: int) -> None:
         """Follow a frame that has left the interface."""
@@ -107,5 +117,6 @@ class InterfaceRestart:
             self._conditions.event(f"{self.condition}s", text, now)
         self._restarts = 0
         self._requested_ns = -NEVER
+        self._is_pending = False
         self._pause_ns = self._after_ns
         self._conditions.forget(self.condition)
