@@ -137,22 +137,26 @@ class Ring:
     ) -> int:
         """Append entries. Return the number of dropped entries that were not written.
 
-        ``holds``: old entries are kept until the size is reached, because a disk that fails should
-        not cost the seconds before an event.
+        ``holds``: old entries are kept, and new entries are dropped if the ring is full. A disk
+        that fails should not cost the seconds before an event.
         """
         lost = 0
         for part in _cut(items):
             begin_ns, kind, _, state, _, _ = part[0]
-            if kind == EntryKind.STATE:
-                self._segments.append(Segment(begin_ns, state, offset, clock))
-                self._is_cut = False
-            elif self._is_cut:
+            is_begin = kind == EntryKind.STATE
+            is_held = holds and bool(self._segments)
+            if self._is_cut and (is_held or not is_begin):
                 lost += len(part)
                 continue
-            elif not self._segments:
-                self._segments.append(Segment(begin_ns, b"", offset, clock))
-            self._number += 1
             payload = packed(data_payload(part))
+            if holds and self.bytes + len(payload.stored) > self._max_bytes:
+                lost += len(part)
+                self._is_cut = True
+                continue
+            self._is_cut = False
+            if is_begin or not self._segments:
+                self._segments.append(Segment(begin_ns, state if is_begin else b"", offset, clock))
+            self._number += 1
             chunk = Chunk(self._number, begin_ns, self._segments[-1], payload, len(part))
             self._chunks.append(chunk)
             self.bytes += len(payload.stored)
@@ -249,15 +253,10 @@ class EventRecorder(Recorder):
     # --- in the recorder's thread
 
     def _write(self, items: list[Item], now: int) -> None:
-        if items:
-            self._append_remarks(items, now)
-            is_active = self._until_ns is not None
-            holds = is_active and self._file is None
-            dropped = self._ring.add(items, self._offset, self._recorded_clock, holds)
-            if is_active:
-                self._unwritten += dropped
-        self.facts.ring_bytes = self._ring.bytes
         self._take_triggers()
+        if items:
+            self._add(items, now)
+        self.facts.ring_bytes = self._ring.bytes
         if now >= self._check_ns:
             self._check(now)
         if self._is_usable and self._until_ns is not None:
@@ -265,6 +264,27 @@ class EventRecorder(Recorder):
         elif self._is_usable and self.facts.problem:
             self._note_problem("", f"{self._folder}: can be used again")
         self._make_lines()
+
+    def _add(self, items: list[Item], now: int) -> None:
+        """Add entries to the ring. Count those that a capture will not have."""
+        is_active = self._until_ns is not None
+        holds = is_active and self._file is None
+        remarked = self._recorded_losses
+        given = len(items)
+        self._append_remarks(items, now)
+        dropped = self._ring.add(items, self._offset, self._recorded_clock, holds)
+        if holds and dropped:  # the remarks were dropped, too, so they are made again
+            dropped -= len(items) - given
+            self._recorded_losses = remarked
+            self._offset = 0
+            self._clock_ns = 0
+        if is_active:
+            self._unwritten += dropped
+        is_full = holds and dropped > 0
+        text = "captures: there is room in memory again"
+        if is_full:
+            text = "captures: the memory is full, so input is lost until the folder can be used"
+        self._worker.faults.note("captures: memory", is_full, text)
 
     def _fail(self, error: Exception, now: int) -> None:
         super()._fail(error, now)
@@ -319,7 +339,15 @@ class EventRecorder(Recorder):
             if self.facts.event is not None:
                 self.facts.event = self.facts.event | {"file": str(file.path)}
         if self._ring.is_complete(until_ns):
+            if file is None and not self._has_next_part:
+                self._report_lost_capture()
             self._end_capture()
+
+    def _report_lost_capture(self) -> None:
+        """Log that a capture has no entry, because none of its segments fit into the ring."""
+        name = f"event: {self._listed[0].in_words}"
+        text = f"{name}: could not be recorded, because the memory is too small for the input"
+        self._lines.append((name, text))
 
     @property
     def _list(self) -> list[dict[str, Any]]:
