@@ -161,6 +161,26 @@ def test_a_capture_on_an_event_has_parts(tmp_path: Path) -> None:
     assert "undervoltage" in found.provenance["recorded because of"]
 
 
+def test_the_part_with_the_event_is_not_removed_while_its_capture_goes_on(tmp_path: Path) -> None:
+    flight = Flight(tmp_path, before_s=1, after_s=300, part_minutes=1, keep_mb=1)
+    flight.fly(20)
+    event = flight.event("undervoltage")
+    flight.fly(260)
+    assert flight.it.facts.file
+    parts = [path.stem.rpartition("-")[2] for path in flight.captures()]
+    assert parts[0] == "00000"
+    assert "00001" not in parts, "the limit removes the other parts"
+    frames, _ = replayed(flight.captures()[0])
+    begin = event - 1 * SECOND
+    end = event + 1 * SECOND
+    assert between(frames, begin, end) == flight.sent(begin, end)
+    flight.fly(60)
+    assert not flight.it.facts.file
+    flight.it.close()
+    recorder.remove_oldest(tmp_path, 1, flight.it._spared)
+    assert flight.captures() == [], "after its end the capture can be removed"
+
+
 def test_the_end_of_the_gateway_ends_a_capture(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=5, after_s=600)
     flight.fly(10)

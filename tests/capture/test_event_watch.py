@@ -82,9 +82,26 @@ def test_each_rise_of_an_error_bit_is_an_event() -> None:
         "right: undervoltage",
         "right: power_stage_overtemp_warning",
     ]
-    it.live()
+    _steady(it, 1.1)
+    it.taken()
     it.live(errors=HOT)
     assert it.taken() == ["left: power_stage_overtemp_warning"]
+
+
+def test_a_bit_that_flickers_is_one_event_until_it_is_clear_for_a_second() -> None:
+    it = Watched()
+    for _ in range(100):
+        it.live(errors=UNDERVOLTAGE)
+        it.live()
+    assert it.taken() == ["left: undervoltage"]
+    it.live(errors=UNDERVOLTAGE | HOT)
+    assert it.taken() == ["left: power_stage_overtemp_warning"]
+    _steady(it, 0.9)
+    it.live(errors=UNDERVOLTAGE)
+    assert it.taken() == []
+    _steady(it, 1.1)
+    it.live(errors=UNDERVOLTAGE)
+    assert it.taken() == ["left: undervoltage"]
 
 
 def test_a_bit_that_is_set_in_one_frame_of_a_read_is_noticed() -> None:

@@ -365,10 +365,14 @@ class EventRecorder(Recorder):
         if segment.state:
             known["state"] = read_json(segment.state)
         self._is_list_written = True
-        return self._open_part(first.begin_ns, segment.offset, segment.clock, known)
+        file = self._open_part(first.begin_ns, segment.offset, segment.clock, known)
+        if not self._has_next_part:
+            self._spared = file.path  # it has the event
+        return file
 
     def _end_capture(self) -> None:
         self._end_part()
+        self._spared = None
         self._until_ns = None
         self._has_next_part = False
         self._listed = []

@@ -23,7 +23,7 @@ OnEvent = Callable[[int, float, str, str], None]
 _WORDS = ("operating_errors", "selftest_errors")
 _ALL_BITS = -1
 _REARM_NS = SECOND
-"""Time for which a condition must be unmet before it can be an event again."""
+"""Time for which a condition must be unmet, or a bit clear, before it can be an event again."""
 
 
 class EventWatch:
@@ -53,7 +53,7 @@ class EventWatch:
         if events & Event.LINK and esc.has_lost_telemetry():
             reasons.append("telemetry lost")
         if events & (Event.STATE | Event.INFO):
-            reasons += esc.new_errors()
+            reasons += esc.new_errors(now)
         for limit in esc.limits:
             if events & limit.events:
                 count = steps(limit.value, esc.state, self._status, now)
@@ -101,6 +101,35 @@ _EVENTS = {
 }
 
 
+class _Bits:
+    """The error bits of a word."""
+
+    def __init__(self, bits: Sequence[ErrorBit], chosen: Sequence[str]) -> None:
+        self._bits = bits
+        self._mask = _mask(bits, chosen)
+        self._word = 0
+        self._clear_since: dict[int, int] = {}
+        """Time of the last change to 0, by number of the bit."""
+
+    def risen(self, word: int, now: int) -> list[str]:
+        """Return the texts of the bits that are set now, and were clear for a second before.
+
+        So a bit that flickers makes one event.
+        """
+        changed = word ^ self._word
+        self._word = word
+        risen = 0
+        for number in range(changed.bit_length()):
+            bit = 1 << number
+            if changed & bit and not word & bit:
+                self._clear_since[number] = now
+            elif changed & bit & self._mask:
+                since = self._clear_since.get(number)
+                if since is None or now - since >= _REARM_NS:
+                    risen |= bit
+        return bit_texts(risen, self._bits)
+
+
 class _WatchedEsc:
     """What is remembered of one ESC."""
 
@@ -114,9 +143,7 @@ class _WatchedEsc:
                 value = values_of(state.protocol)[about.value.name]
                 self.limits.append(_Limit(about, value))
         errors = state.protocol.errors
-        self._bits: list[Sequence[ErrorBit]] = [errors.get(word, ()) for word in _WORDS]
-        self._masks = [_mask(bits, config.errors) for bits in self._bits]
-        self._words = [0] * len(_WORDS)
+        self._words = [_Bits(errors.get(word, ()), config.errors) for word in _WORDS]
         self._had_telemetry = False
 
     def has_lost_telemetry(self) -> bool:
@@ -125,7 +152,7 @@ class _WatchedEsc:
         self._had_telemetry = self.state.up
         return had_telemetry and not self._had_telemetry
 
-    def new_errors(self) -> list[str]:
+    def new_errors(self, now: int) -> list[str]:
         """Return the texts of the error bits that have been set since the last call.
 
         While a word is not available, its bits keep their state.
@@ -134,9 +161,7 @@ class _WatchedEsc:
         for place, reading in enumerate((self.state.live, self.state.info)):
             word = self.state.protocol.value(_WORDS[place], reading)
             if word is not None:
-                risen = word & ~self._words[place] & self._masks[place]
-                self._words[place] = word
-                texts += bit_texts(risen, self._bits[place])
+                texts += self._words[place].risen(word, now)
         return texts
 
 
