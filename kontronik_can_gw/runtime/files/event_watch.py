@@ -52,10 +52,12 @@ class EventWatch:
         reasons = []
         if events & Event.LINK and esc.has_lost_telemetry():
             reasons.append("telemetry lost")
+            esc.forget_values()
         if events & (Event.STATE | Event.INFO):
             reasons += esc.new_errors(now)
         for limit in esc.limits:
-            if events & limit.events:
+            is_known = esc.was_heard or limit.value.group is not Group.LINK
+            if events & limit.events and is_known:
                 count = steps(limit.value, esc.state, self._status, now)
                 if limit.is_crossed(physical(limit.value, esc.state, count), now):
                     reasons.append(limit.condition.text)
@@ -71,25 +73,32 @@ class _Limit:
         self.value = value
         self.events = _EVENTS[value.pace or value.group]
         """Events with which the value may have changed."""
-        self._is_armed = True
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin again: the next value is the first one that is known."""
+        self._is_armed = False
+        self._rearm_ns = 0
+        """Time for which the condition must be unmet before it can be an event."""
         self._unmet_since: int | None = None
 
     def is_crossed(self, number: float | None, now: int) -> bool:
-        """Return True if the condition is met, and was not met for a second before.
+        """Return True if the condition is met, and was unmet before.
 
-        So a value that is noisy at its limit makes one event. A value that is not available changes
-        nothing.
+        After it was met, it must be unmet for a second, so a value that is noisy at its limit makes
+        one event. A value that is not available changes nothing.
         """
         if number is None:
             return False
         if not self.condition.compare(number, self.condition.limit):
             if self._unmet_since is None:
                 self._unmet_since = now
-            elif now - self._unmet_since >= _REARM_NS:
+            if now - self._unmet_since >= self._rearm_ns:
                 self._is_armed = True
             return False
         was_armed = self._is_armed
         self._is_armed = False
+        self._rearm_ns = _REARM_NS
         self._unmet_since = None
         return was_armed
 
@@ -145,12 +154,21 @@ class _WatchedEsc:
         errors = state.protocol.errors
         self._words = [_Bits(errors.get(word, ()), config.errors) for word in _WORDS]
         self._had_telemetry = False
+        self.was_heard = False
+        """True after the ESC has sent live data."""
 
     def has_lost_telemetry(self) -> bool:
         """Return True if live data was fresh at the last call, and is not any more."""
         had_telemetry = self._had_telemetry
         self._had_telemetry = self.state.up
+        self.was_heard |= self.state.up
         return had_telemetry and not self._had_telemetry
+
+    def forget_values(self) -> None:
+        """Forget the values that become unknown with a loss of telemetry."""
+        for limit in self.limits:
+            if limit.value.group is not Group.LINK:
+                limit.forget()
 
     def new_errors(self, now: int) -> list[str]:
         """Return the texts of the error bits that have been set since the last call.
