@@ -181,6 +181,36 @@ def test_the_part_with_the_event_is_not_removed_while_its_capture_goes_on(tmp_pa
     assert flight.captures() == [], "after its end the capture can be removed"
 
 
+def test_of_very_many_events_at_once_the_first_are_listed_and_all_are_counted(
+    tmp_path: Path,
+) -> None:
+    flight = Flight(tmp_path, before_s=1, after_s=3)
+    flight.fly(16)
+    for number in range(1100):
+        flight.event(f"event {number}")
+    flight.fly(1)
+    assert flight.it.facts.events == 1100
+    name, _ = flight.it.take_events()[0]
+    assert name == "event: e0: event 0"
+    flight.fly(8)
+    flight.it.close()
+    _, found = replayed(flight.captures()[0])
+    assert "e0: event 0 (" in found.provenance["recorded because of"]
+
+
+def test_the_last_of_very_many_events_at_once_extends_a_capture(tmp_path: Path) -> None:
+    flight = Flight(tmp_path, before_s=1, after_s=3)
+    flight.fly(16)
+    for number in range(1000):
+        flight.event(f"event {number}")
+    last = flight.now + 5 * SECOND
+    flight.it.trigger(last, 1.0, "e0", "last")
+    flight.fly(15)
+    flight.it.close()
+    frames, _ = replayed(flight.captures()[0])
+    assert frames[-1].time_ns >= last + 3 * SECOND - SECOND // 10
+
+
 def test_the_end_of_the_gateway_ends_a_capture(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=5, after_s=600)
     flight.fly(10)

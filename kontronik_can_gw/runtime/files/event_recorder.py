@@ -46,7 +46,7 @@ _BYTES_PER_S = 20_000
 _MAX_LISTED = 100
 """Number of events that a capture lists. Later ones are only counted."""
 _MAX_WAITING = 1000
-"""Number of events that can occur within half a second."""
+"""Number of events that can wait for the recorder's thread. Later ones are only counted."""
 
 
 def ring_bytes(config: RecordConfig, escs: int) -> int:
@@ -226,7 +226,12 @@ class EventRecorder(Recorder):
         self.facts = EventRecorderFacts()
         self._ring = Ring(config.before_s * SECOND + _MARGIN_NS, ring_bytes(config, escs))
         self._after_ns = config.after_s * SECOND
-        self._triggers: deque[RecordedEvent] = deque(maxlen=_MAX_WAITING)
+        self._triggers: deque[RecordedEvent] = deque()
+        self._dropped_events = 0
+        """Number of events that could not wait. Only the loop's thread counts them."""
+        self._newest_ns = 0
+        """Time of the last event."""
+        self._taken = 0
         self._until_ns: int | None = None
         """Time at which the capture may end. None while nothing is recorded."""
         self._listed: list[RecordedEvent] = []
@@ -236,7 +241,7 @@ class EventRecorder(Recorder):
         """True if the next part continues a capture."""
         self._new: list[RecordedEvent] = []
         """Events that were not logged yet."""
-        self._lines: deque[tuple[str, str]] = deque(maxlen=_MAX_WAITING)
+        self._lines: deque[tuple[str, str]] = deque()
 
     # --- in the loop's thread
 
@@ -245,7 +250,11 @@ class EventRecorder(Recorder):
 
     def trigger(self, time_ns: int, wall: float, esc: str, reason: str) -> None:
         """Report an event. Never waits."""
-        self._triggers.append(RecordedEvent(time_ns, wall, esc, reason))
+        self._newest_ns = max(self._newest_ns, time_ns)
+        if len(self._triggers) < _MAX_WAITING:
+            self._triggers.append(RecordedEvent(time_ns, wall, esc, reason))
+        else:
+            self._dropped_events += 1
 
     def take_events(self) -> list[tuple[str, str]]:
         return [self._lines.popleft() for _ in range(len(self._lines))]
@@ -295,12 +304,13 @@ class EventRecorder(Recorder):
         """Begin or extend the capture for the events that have occurred."""
         for _ in range(len(self._triggers)):
             event = self._triggers.popleft()
-            self._until_ns = max(self._until_ns or 0, event.time_ns + self._after_ns)
+            self._until_ns = self._newest_ns + self._after_ns
             self._new.append(event)
             if len(self._listed) < _MAX_LISTED:
                 self._listed.append(event)
                 self._is_list_written = False
-            self.facts.events += 1
+            self._taken += 1
+            self.facts.events = self._taken + self._dropped_events
             self.facts.event = {
                 "time": utc(event.wall),
                 "esc": event.esc,
@@ -315,7 +325,8 @@ class EventRecorder(Recorder):
             place = f"cannot be recorded yet: {self.facts.problem}"
         for event in self._new:
             name = f"event: {event.in_words}"
-            self._lines.append((name, f"{name}: {place}"))
+            if len(self._lines) < _MAX_WAITING:
+                self._lines.append((name, f"{name}: {place}"))
         self._new = []
 
     def _write_ring(self, until_ns: int, now: int) -> None:
