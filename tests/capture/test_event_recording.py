@@ -312,6 +312,7 @@ def test_a_capture_without_any_entry_is_reported(
         name,
         f"{name}: could not be recorded, because the memory is too small for the input",
     ) in lines
+    assert flight.it.facts.event is None
     flight.it.close()
     assert flight.captures() == []
 

@@ -162,7 +162,7 @@ def test_a_value_that_crosses_its_limit_in_one_frame_is_an_event() -> None:
     it.live(throttle=89, esc=1)
     assert it.taken() == []
     it.live(throttle=90, esc=1)
-    assert it.taken() == ["right: right.throttle >= 90"]
+    assert it.taken() == ["right: throttle >= 90"]
 
 
 def _steady(it: Watched, seconds: float, **values: int) -> None:

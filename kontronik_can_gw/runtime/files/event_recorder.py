@@ -83,7 +83,7 @@ class EventRecorderFacts(RecorderFacts):
     event: dict[str, str] | None = None
     """The last event: its ``time`` in UTC, ``esc``, ``reason`` and ``file``.
 
-    The file is empty until the event is recorded.
+    The file is empty until the event is recorded. None if it could not be recorded.
     """
 
 
@@ -359,6 +359,7 @@ class EventRecorder(Recorder):
         name = f"event: {self._listed[0].in_words}"
         text = f"{name}: could not be recorded, because the memory is too small for the input"
         self._lines.append((name, text))
+        self.facts.event = None
 
     @property
     def _list(self) -> list[dict[str, Any]]:
