@@ -30,7 +30,7 @@ class Condition(NamedTuple):
     """A value of an ESC on one side of a limit."""
 
     text: str
-    """The condition as the user wrote it, without further spaces."""
+    """The condition as the user wrote it, without the ESC and further spaces."""
     esc: str
     """Normalized name of the only ESC for which it holds. Empty: all ESCs."""
     value: Value
@@ -49,14 +49,15 @@ def condition(text: str) -> Condition:
         raise ValueError(f"{text!r}: {sign} is unknown. Use one of {', '.join(_OPERATORS)}")
     value = _value(text, name.strip())
     limit = _limit(text, rest, value)
-    return Condition(" ".join(text.split()), normalize(esc), value, _OPERATORS[sign], limit)
+    about = text[match.start(2) :]
+    return Condition(" ".join(about.split()), normalize(esc), value, _OPERATORS[sign], limit)
 
 
 def _value(text: str, name: str) -> Value:
     value = VALUES_BY_KEY.get(normalize(name))
     if value is None:
         near = did_you_mean(name, [each.name for each in VALUES_BY_KEY.values()], 0.5)
-        raise ValueError(f"{text!r}: there is no value {name!r}.{near}")
+        raise ValueError(f"{text!r}: there is no value {name!r}{near and f'.{near}'}")
     if value.group is Group.GATEWAY:
         raise ValueError(f"{text!r}: {value.name} is a value of the gateway, not of an ESC")
     if value.names:
@@ -103,7 +104,7 @@ def _check_each(values: list[Any], check: Callable[[Any], object]) -> None:
         except ValueError as error:
             problems.append(str(error))
     if problems:
-        raise ValueError("; ".join(problems))
+        raise ValueError("; ".join(problems).replace("?; ", "? "))
 
 
 _TEXT = {"type": "string", "pattern": r"^[^<>=!]*[<>]=?\s*[-+]?[0-9].*$"}

@@ -31,7 +31,9 @@ from kontronik_can_gw.times import END_OF_TIME
 
 _MAX_FRAMES = 256
 _WORD = (1 << 64) - 1
-_LIVE_IN_PYTHON = "Python handles each live frame, too: a PDO or another output needs it"
+_LIVE_IN_PYTHON = (
+    "Python handles each live frame, too: a PDO, record.when or another output needs it"
+)
 _Core = structure("kcg")
 _Plan = structure("kcg_plan")
 _Esc = structure("kcg_esc")

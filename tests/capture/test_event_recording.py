@@ -161,6 +161,56 @@ def test_a_capture_on_an_event_has_parts(tmp_path: Path) -> None:
     assert "undervoltage" in found.provenance["recorded because of"]
 
 
+def test_the_part_with_the_event_is_not_removed_while_its_capture_goes_on(tmp_path: Path) -> None:
+    flight = Flight(tmp_path, before_s=1, after_s=300, part_minutes=1, keep_mb=1)
+    flight.fly(20)
+    event = flight.event("undervoltage")
+    flight.fly(260)
+    assert flight.it.facts.file
+    parts = [path.stem.rpartition("-")[2] for path in flight.captures()]
+    assert parts[0] == "00000"
+    assert "00001" not in parts, "the limit removes the other parts"
+    frames, _ = replayed(flight.captures()[0])
+    begin = event - 1 * SECOND
+    end = event + 1 * SECOND
+    assert between(frames, begin, end) == flight.sent(begin, end)
+    flight.fly(60)
+    assert not flight.it.facts.file
+    flight.it.close()
+    recorder.remove_oldest(tmp_path, 1, flight.it._spared)
+    assert flight.captures() == [], "after its end the capture can be removed"
+
+
+def test_of_very_many_events_at_once_the_first_are_listed_and_all_are_counted(
+    tmp_path: Path,
+) -> None:
+    flight = Flight(tmp_path, before_s=1, after_s=3)
+    flight.fly(16)
+    for number in range(1100):
+        flight.event(f"event {number}")
+    flight.fly(1)
+    assert flight.it.facts.events == 1100
+    name, _ = flight.it.take_events()[0]
+    assert name == "event: e0: event 0"
+    flight.fly(8)
+    flight.it.close()
+    _, found = replayed(flight.captures()[0])
+    assert "e0: event 0 (" in found.provenance["recorded because of"]
+
+
+def test_the_last_of_very_many_events_at_once_extends_a_capture(tmp_path: Path) -> None:
+    flight = Flight(tmp_path, before_s=1, after_s=3)
+    flight.fly(16)
+    for number in range(1000):
+        flight.event(f"event {number}")
+    last = flight.now + 5 * SECOND
+    flight.it.trigger(last, 1.0, "e0", "last")
+    flight.fly(15)
+    flight.it.close()
+    frames, _ = replayed(flight.captures()[0])
+    assert frames[-1].time_ns >= last + 3 * SECOND - SECOND // 10
+
+
 def test_the_end_of_the_gateway_ends_a_capture(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=5, after_s=600)
     flight.fly(10)
@@ -190,6 +240,81 @@ def test_an_event_while_the_folder_is_unusable_is_recorded_later(tmp_path: Path)
     begin = event - 5 * SECOND
     end = event + 3 * SECOND
     assert between(frames, begin, end) == flight.sent(begin, end)
+
+
+def test_an_event_is_recorded_after_any_time_without_the_disk(tmp_path: Path) -> None:
+    folder = tmp_path / "captures"
+    folder.write_text("not a folder")
+    flight = Flight(folder, before_s=1, after_s=1)
+    flight.fly(20)
+    event = flight.event("undervoltage")
+    flight.fly(60)
+    flight.event("a later one")
+    flight.fly(20)
+    full = [report.text for report in flight.it.reports(0) if report.name == "captures: memory"]
+    assert full == [
+        "captures: the memory is full, so input is lost until the folder can be used",
+    ]
+    lost = flight.it.facts.lost
+    assert lost > 1000
+    folder.unlink()
+    flight.fly(15)
+    flight.it.close()
+    [path] = flight.captures()
+    frames, found = replayed(path)
+    begin = event - 1 * SECOND
+    end = event + 1 * SECOND
+    assert between(frames, begin, end) == flight.sent(begin, end)
+    assert "e0: undervoltage (" in found.provenance["recorded because of"]
+    assert "e0: a later one (" in found.provenance["recorded because of"]
+    facts = flight.it.facts
+    assert facts.events == 2
+    assert facts.event is not None
+    assert facts.event["file"] == str(path)
+    [end_of_fault] = [each for each in flight.it.reports(0) if each.name == "captures: memory"]
+    assert not end_of_fault.begins
+
+
+def test_entries_and_an_event_that_waited_for_the_thread_are_recorded(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(recorder, "_AT_ONCE", recorder.CAPACITY)
+    flight = Flight(tmp_path, before_s=1, after_s=1)
+    flight.fly(20)
+    work = flight.it._work
+    flight.it._work = lambda _items: None  # type: ignore[method-assign]
+    event = flight.event("undervoltage")
+    flight.fly(25)
+    flight.it._work = work  # type: ignore[method-assign]
+    flight.fly(4)
+    flight.it.close()
+    frames, _ = replayed(flight.captures()[0])
+    begin = event - 1 * SECOND
+    end = event + 1 * SECOND
+    assert between(frames, begin, end) == flight.sent(begin, end)
+
+
+def test_a_capture_without_any_entry_is_reported(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(event_recorder, "_BYTES_PER_S", 1)
+    flight = Flight(tmp_path, before_s=1, after_s=1)
+    flight.fly(4)
+    flight.event("undervoltage")
+    flight.fly(8)
+    flight.it._ring._max_bytes = 1 << 20
+    flight.fly(4)
+    name = "event: e0: undervoltage"
+    lines = flight.it.take_events()
+    assert (
+        name,
+        f"{name}: could not be recorded, because the memory is too small for the input",
+    ) in lines
+    assert flight.it.facts.event is None
+    flight.it.close()
+    assert flight.captures() == []
 
 
 @pytest.mark.parametrize("failing", ["append", "sync"])

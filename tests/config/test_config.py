@@ -68,7 +68,7 @@ def problems(given_tables: Any) -> list[str]:
     ("text", "problem"),
     [
         ("batery_voltage < 3", "there is no value 'batery_voltage'. Did you mean battery_voltage?"),
-        ("left.x < 3", "there is no value 'x'."),
+        ("left.x < 3", "there is no value 'x'"),
         ("battery_voltage = 3", "= is unknown. Use one of <, <=, >, >="),
         ("battery_voltage <> 3", "<> is unknown. Use one of <, <=, >, >="),
         ("battery_voltage < x", "'x' is not a number"),
@@ -90,10 +90,11 @@ def test_a_wrong_condition_is_one_clear_mistake(text: str, problem: str) -> None
 
 
 def test_all_wrong_conditions_and_error_bits_are_named_at_once() -> None:
-    record = {"when": ["a < 1", 3, "battery_voltage < 20"], "errors": ["x", "undervoltag"]}
+    wrong = ["a < 1", "batery_voltage < 1", 3, "battery_voltage < 20"]
+    record = {"when": wrong, "errors": ["x", "undervoltag"]}
     when, errors = problems(tables() | {"record": record})
-    assert "there is no value 'a'" in when
-    assert when.endswith("; 3 is not a string")
+    assert "there is no value 'a'; 'batery_voltage < 1': " in when
+    assert when.endswith("Did you mean battery_voltage? 3 is not a string")
     assert "'x' is neither error, warning or status nor an error bit; 'undervoltag'" in errors
     assert errors.endswith("Did you mean undervoltage?")
 

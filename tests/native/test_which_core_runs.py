@@ -198,7 +198,8 @@ def test_note_of_the_c_core_tells_that_an_output_follows_live_frames() -> None:
     core = Gateway([EscSettings()], EMPTY, 0).core
     assert (core.language, core.note) == ("C", "")
     core.followers = [Follower(Event.LINK | Event.LIVE, lambda *_: None)]
-    assert core.note == "Python handles each live frame, too: a PDO or another output needs it"
+    reason = "a PDO, record.when or another output needs it"
+    assert core.note == f"Python handles each live frame, too: {reason}"
     core.followers = [Follower(Event.LINK, lambda *_: None)]
     assert core.note == ""
 

@@ -169,9 +169,9 @@ def test_the_last_recorded_event_and_its_file_are_shown() -> None:
     assert "recording waits for an event, with 1.2 MB in memory" in shown
     assert "last event" not in shown
     facts.event = {"time": "2026-11-28T21:00:00Z", "esc": "e1", "reason": "hot", "file": ""}
-    assert "last event at 2026-11-28T21:00:00Z: e1: hot, not recorded yet" in words(
-        judged(document)
-    )
+    shown = words(judged(document))
+    assert "last event at 2026-11-28T21:00:00Z: e1: hot, not recorded yet" in shown
+    assert "recording waits for the disk, with 1.2 MB in memory" in shown
     facts.event |= {"esc": "", "file": "/captures/a.kcap"}
     facts.file = "/captures/a.kcap"
     shown = words(judged(document))

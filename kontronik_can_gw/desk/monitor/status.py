@@ -399,10 +399,12 @@ def _further(document: Document) -> Iterator[Text]:
 
 def _events(recording: Document) -> Iterator[Text]:
     """Yield lines about the recording on events."""
-    if not recording["file"]:
-        size = f"{recording['ring_bytes'] / 1e6:.1f} MB"
-        yield line(f"recording waits for an event, with {size} in memory")
     event = recording["event"]
+    if not recording["file"]:
+        is_waiting = event is not None and not event["file"]
+        awaited = "the disk" if is_waiting else "an event"
+        size = f"{recording['ring_bytes'] / 1e6:.1f} MB"
+        yield line(f"recording waits for {awaited}, with {size} in memory")
     if event is not None:
         about = f"{event['esc']}: {event['reason']}" if event["esc"] else event["reason"]
         place = event["file"] or "not recorded yet"

@@ -46,7 +46,7 @@ _BYTES_PER_S = 20_000
 _MAX_LISTED = 100
 """Number of events that a capture lists. Later ones are only counted."""
 _MAX_WAITING = 1000
-"""Number of events that can occur within half a second."""
+"""Number of events that can wait for the recorder's thread. Later ones are only counted."""
 
 
 def ring_bytes(config: RecordConfig, escs: int) -> int:
@@ -83,7 +83,7 @@ class EventRecorderFacts(RecorderFacts):
     event: dict[str, str] | None = None
     """The last event: its ``time`` in UTC, ``esc``, ``reason`` and ``file``.
 
-    The file is empty until the event is recorded.
+    The file is empty until the event is recorded. None if it could not be recorded.
     """
 
 
@@ -137,22 +137,26 @@ class Ring:
     ) -> int:
         """Append entries. Return the number of dropped entries that were not written.
 
-        ``holds``: old entries are kept until the size is reached, because a disk that fails should
-        not cost the seconds before an event.
+        ``holds``: old entries are kept, and new entries are dropped if the ring is full. A disk
+        that fails should not cost the seconds before an event.
         """
         lost = 0
         for part in _cut(items):
             begin_ns, kind, _, state, _, _ = part[0]
-            if kind == EntryKind.STATE:
-                self._segments.append(Segment(begin_ns, state, offset, clock))
-                self._is_cut = False
-            elif self._is_cut:
+            is_begin = kind == EntryKind.STATE
+            is_held = holds and bool(self._segments)
+            if self._is_cut and (is_held or not is_begin):
                 lost += len(part)
                 continue
-            elif not self._segments:
-                self._segments.append(Segment(begin_ns, b"", offset, clock))
-            self._number += 1
             payload = packed(data_payload(part))
+            if holds and self.bytes + len(payload.stored) > self._max_bytes:
+                lost += len(part)
+                self._is_cut = True
+                continue
+            self._is_cut = False
+            if is_begin or not self._segments:
+                self._segments.append(Segment(begin_ns, state if is_begin else b"", offset, clock))
+            self._number += 1
             chunk = Chunk(self._number, begin_ns, self._segments[-1], payload, len(part))
             self._chunks.append(chunk)
             self.bytes += len(payload.stored)
@@ -222,7 +226,12 @@ class EventRecorder(Recorder):
         self.facts = EventRecorderFacts()
         self._ring = Ring(config.before_s * SECOND + _MARGIN_NS, ring_bytes(config, escs))
         self._after_ns = config.after_s * SECOND
-        self._triggers: deque[RecordedEvent] = deque(maxlen=_MAX_WAITING)
+        self._triggers: deque[RecordedEvent] = deque()
+        self._dropped_events = 0
+        """Number of events that could not wait. Only the loop's thread counts them."""
+        self._newest_ns = 0
+        """Time of the last event."""
+        self._taken = 0
         self._until_ns: int | None = None
         """Time at which the capture may end. None while nothing is recorded."""
         self._listed: list[RecordedEvent] = []
@@ -232,7 +241,7 @@ class EventRecorder(Recorder):
         """True if the next part continues a capture."""
         self._new: list[RecordedEvent] = []
         """Events that were not logged yet."""
-        self._lines: deque[tuple[str, str]] = deque(maxlen=_MAX_WAITING)
+        self._lines: deque[tuple[str, str]] = deque()
 
     # --- in the loop's thread
 
@@ -241,7 +250,11 @@ class EventRecorder(Recorder):
 
     def trigger(self, time_ns: int, wall: float, esc: str, reason: str) -> None:
         """Report an event. Never waits."""
-        self._triggers.append(RecordedEvent(time_ns, wall, esc, reason))
+        self._newest_ns = max(self._newest_ns, time_ns)
+        if len(self._triggers) < _MAX_WAITING:
+            self._triggers.append(RecordedEvent(time_ns, wall, esc, reason))
+        else:
+            self._dropped_events += 1
 
     def take_events(self) -> list[tuple[str, str]]:
         return [self._lines.popleft() for _ in range(len(self._lines))]
@@ -249,15 +262,10 @@ class EventRecorder(Recorder):
     # --- in the recorder's thread
 
     def _write(self, items: list[Item], now: int) -> None:
-        if items:
-            self._append_remarks(items, now)
-            is_active = self._until_ns is not None
-            holds = is_active and self._file is None
-            dropped = self._ring.add(items, self._offset, self._recorded_clock, holds)
-            if is_active:
-                self._unwritten += dropped
-        self.facts.ring_bytes = self._ring.bytes
         self._take_triggers()
+        if items:
+            self._add(items, now)
+        self.facts.ring_bytes = self._ring.bytes
         if now >= self._check_ns:
             self._check(now)
         if self._is_usable and self._until_ns is not None:
@@ -265,6 +273,27 @@ class EventRecorder(Recorder):
         elif self._is_usable and self.facts.problem:
             self._note_problem("", f"{self._folder}: can be used again")
         self._make_lines()
+
+    def _add(self, items: list[Item], now: int) -> None:
+        """Add entries to the ring. Count those that a capture will not have."""
+        is_active = self._until_ns is not None
+        holds = is_active and self._file is None
+        remarked = self._recorded_losses
+        given = len(items)
+        self._append_remarks(items, now)
+        dropped = self._ring.add(items, self._offset, self._recorded_clock, holds)
+        if holds and dropped:  # the remarks were dropped, too, so they are made again
+            dropped -= len(items) - given
+            self._recorded_losses = remarked
+            self._offset = 0
+            self._clock_ns = 0
+        if is_active:
+            self._unwritten += dropped
+        is_full = holds and dropped > 0
+        text = "captures: there is room in memory again"
+        if is_full:
+            text = "captures: the memory is full, so input is lost until the folder can be used"
+        self._worker.faults.note("captures: memory", is_full, text)
 
     def _fail(self, error: Exception, now: int) -> None:
         super()._fail(error, now)
@@ -275,12 +304,13 @@ class EventRecorder(Recorder):
         """Begin or extend the capture for the events that have occurred."""
         for _ in range(len(self._triggers)):
             event = self._triggers.popleft()
-            self._until_ns = max(self._until_ns or 0, event.time_ns + self._after_ns)
+            self._until_ns = self._newest_ns + self._after_ns
             self._new.append(event)
             if len(self._listed) < _MAX_LISTED:
                 self._listed.append(event)
                 self._is_list_written = False
-            self.facts.events += 1
+            self._taken += 1
+            self.facts.events = self._taken + self._dropped_events
             self.facts.event = {
                 "time": utc(event.wall),
                 "esc": event.esc,
@@ -295,7 +325,8 @@ class EventRecorder(Recorder):
             place = f"cannot be recorded yet: {self.facts.problem}"
         for event in self._new:
             name = f"event: {event.in_words}"
-            self._lines.append((name, f"{name}: {place}"))
+            if len(self._lines) < _MAX_WAITING:
+                self._lines.append((name, f"{name}: {place}"))
         self._new = []
 
     def _write_ring(self, until_ns: int, now: int) -> None:
@@ -319,7 +350,16 @@ class EventRecorder(Recorder):
             if self.facts.event is not None:
                 self.facts.event = self.facts.event | {"file": str(file.path)}
         if self._ring.is_complete(until_ns):
+            if file is None and not self._has_next_part:
+                self._report_lost_capture()
             self._end_capture()
+
+    def _report_lost_capture(self) -> None:
+        """Log that a capture has no entry, because none of its segments fit into the ring."""
+        name = f"event: {self._listed[0].in_words}"
+        text = f"{name}: could not be recorded, because the memory is too small for the input"
+        self._lines.append((name, text))
+        self.facts.event = None
 
     @property
     def _list(self) -> list[dict[str, Any]]:
@@ -337,10 +377,14 @@ class EventRecorder(Recorder):
         if segment.state:
             known["state"] = read_json(segment.state)
         self._is_list_written = True
-        return self._open_part(first.begin_ns, segment.offset, segment.clock, known)
+        file = self._open_part(first.begin_ns, segment.offset, segment.clock, known)
+        if not self._has_next_part:
+            self._spared = file.path  # it has the event
+        return file
 
     def _end_capture(self) -> None:
         self._end_part()
+        self._spared = None
         self._until_ns = None
         self._has_next_part = False
         self._listed = []

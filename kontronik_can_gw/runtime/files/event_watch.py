@@ -23,7 +23,7 @@ OnEvent = Callable[[int, float, str, str], None]
 _WORDS = ("operating_errors", "selftest_errors")
 _ALL_BITS = -1
 _REARM_NS = SECOND
-"""Time for which a condition must be unmet before it can be an event again."""
+"""Time for which a condition must be unmet, or a bit clear, before it can be an event again."""
 
 
 class EventWatch:
@@ -52,10 +52,12 @@ class EventWatch:
         reasons = []
         if events & Event.LINK and esc.has_lost_telemetry():
             reasons.append("telemetry lost")
+            esc.forget_values()
         if events & (Event.STATE | Event.INFO):
-            reasons += esc.new_errors()
+            reasons += esc.new_errors(now)
         for limit in esc.limits:
-            if events & limit.events:
+            is_known = esc.was_heard or limit.value.group is not Group.LINK
+            if events & limit.events and is_known:
                 count = steps(limit.value, esc.state, self._status, now)
                 if limit.is_crossed(physical(limit.value, esc.state, count), now):
                     reasons.append(limit.condition.text)
@@ -71,25 +73,32 @@ class _Limit:
         self.value = value
         self.events = _EVENTS[value.pace or value.group]
         """Events with which the value may have changed."""
-        self._is_armed = True
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin again: the next value is the first one that is known."""
+        self._is_armed = False
+        self._rearm_ns = 0
+        """Time for which the condition must be unmet before it can be an event."""
         self._unmet_since: int | None = None
 
     def is_crossed(self, number: float | None, now: int) -> bool:
-        """Return True if the condition is met, and was not met for a second before.
+        """Return True if the condition is met, and was unmet before.
 
-        So a value that is noisy at its limit makes one event. A value that is not available changes
-        nothing.
+        After it was met, it must be unmet for a second, so a value that is noisy at its limit makes
+        one event. A value that is not available changes nothing.
         """
         if number is None:
             return False
         if not self.condition.compare(number, self.condition.limit):
             if self._unmet_since is None:
                 self._unmet_since = now
-            elif now - self._unmet_since >= _REARM_NS:
+            if now - self._unmet_since >= self._rearm_ns:
                 self._is_armed = True
             return False
         was_armed = self._is_armed
         self._is_armed = False
+        self._rearm_ns = _REARM_NS
         self._unmet_since = None
         return was_armed
 
@@ -99,6 +108,35 @@ _EVENTS = {
     Group.INFO: Event.INFO,
     Group.LINK: Event.LINK | Event.SECOND,
 }
+
+
+class _Bits:
+    """The error bits of a word."""
+
+    def __init__(self, bits: Sequence[ErrorBit], chosen: Sequence[str]) -> None:
+        self._bits = bits
+        self._mask = _mask(bits, chosen)
+        self._word = 0
+        self._clear_since: dict[int, int] = {}
+        """Time of the last change to 0, by number of the bit."""
+
+    def risen(self, word: int, now: int) -> list[str]:
+        """Return the texts of the bits that are set now, and were clear for a second before.
+
+        So a bit that flickers makes one event.
+        """
+        changed = word ^ self._word
+        self._word = word
+        risen = 0
+        for number in range(changed.bit_length()):
+            bit = 1 << number
+            if changed & bit and not word & bit:
+                self._clear_since[number] = now
+            elif changed & bit & self._mask:
+                since = self._clear_since.get(number)
+                if since is None or now - since >= _REARM_NS:
+                    risen |= bit
+        return bit_texts(risen, self._bits)
 
 
 class _WatchedEsc:
@@ -114,18 +152,25 @@ class _WatchedEsc:
                 value = values_of(state.protocol)[about.value.name]
                 self.limits.append(_Limit(about, value))
         errors = state.protocol.errors
-        self._bits: list[Sequence[ErrorBit]] = [errors.get(word, ()) for word in _WORDS]
-        self._masks = [_mask(bits, config.errors) for bits in self._bits]
-        self._words = [0] * len(_WORDS)
+        self._words = [_Bits(errors.get(word, ()), config.errors) for word in _WORDS]
         self._had_telemetry = False
+        self.was_heard = False
+        """True after the ESC has sent live data."""
 
     def has_lost_telemetry(self) -> bool:
         """Return True if live data was fresh at the last call, and is not any more."""
         had_telemetry = self._had_telemetry
         self._had_telemetry = self.state.up
+        self.was_heard |= self.state.up
         return had_telemetry and not self._had_telemetry
 
-    def new_errors(self) -> list[str]:
+    def forget_values(self) -> None:
+        """Forget the values that become unknown with a loss of telemetry."""
+        for limit in self.limits:
+            if limit.value.group is not Group.LINK:
+                limit.forget()
+
+    def new_errors(self, now: int) -> list[str]:
         """Return the texts of the error bits that have been set since the last call.
 
         While a word is not available, its bits keep their state.
@@ -134,9 +179,7 @@ class _WatchedEsc:
         for place, reading in enumerate((self.state.live, self.state.info)):
             word = self.state.protocol.value(_WORDS[place], reading)
             if word is not None:
-                risen = word & ~self._words[place] & self._masks[place]
-                self._words[place] = word
-                texts += bit_texts(risen, self._bits[place])
+                texts += self._words[place].risen(word, now)
         return texts
 
 

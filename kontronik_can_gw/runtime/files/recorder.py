@@ -127,6 +127,8 @@ class Recorder:
         self._is_usable = False
         """True if the last check found that the folder can be used."""
         self._file: CapturePart | None = None
+        self._spared: Path | None = None
+        """A file that is not removed to make room."""
         self._run = os.urandom(8).hex()
         self._stamp = ""
         self._part = 0
@@ -255,7 +257,7 @@ class Recorder:
         self._check_ns = now + _CHECK_NS
         self._is_usable = False
         self._make_folder()
-        remove_oldest(self._folder, self._config.keep_mb * _MB)
+        remove_oldest(self._folder, self._config.keep_mb * _MB, self._spared)
         status = os.statvfs(self._folder)
         free_bytes = status.f_bavail * status.f_frsize
         minimum = self._config.min_free_mb
@@ -442,10 +444,10 @@ class CapturePart:
             os.close(self._fd)
 
 
-def remove_oldest(folder: Path, keep_bytes: int) -> None:
+def remove_oldest(folder: Path, keep_bytes: int, spared: Path | None = None) -> None:
     """Remove the oldest captures until the folder has at most ``keep_bytes``.
 
-    0 means no limit. Files that any process is writing are kept.
+    0 means no limit. ``spared`` and files that any process is writing are kept.
     """
     if not keep_bytes:
         return
@@ -459,7 +461,7 @@ def remove_oldest(folder: Path, keep_bytes: int) -> None:
     for _, _, size, path in sorted(found):
         if total <= keep_bytes:
             return
-        if not is_locked(path):
+        if path != spared and not is_locked(path):
             with contextlib.suppress(OSError):
                 path.unlink()
                 total -= size
