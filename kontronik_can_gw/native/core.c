@@ -1601,10 +1601,10 @@ int kcg_next_event(kcg *g)
             if (g->mask & KCG_QUIET)
                 return KCG_QUIET;
         }
+        if (g->read_esc < 0)
+            return -1; /* frames that kcg_end found are not processed */
         if (accept_next(g))
             continue;
-        if (g->read_esc < 0)
-            return -1;
         kcg_esc *e = &g->esc[g->read_esc];
         if (e->link == KCG_NEVER_SEEN)
             report(g, g->read_esc, set_link(e, KCG_SEARCHING), g->read_now);

@@ -483,8 +483,8 @@ int kcg_slot_is_news(const kcg *g, uint32_t slot);
 int kcg_slot_is_pending(const kcg *g, uint32_t slot);
 uint64_t kcg_slot_sent(const kcg *g, uint32_t slot);
 #endif
-/* Decides the remaining bytes of a stream that has ended. Frames in them are stored in g->found,
-   but not processed. */
+/* Decides the remaining bytes of a stream that has ended. Frames in them are stored in g->found
+   until the next kcg_receive, but not processed. */
 void kcg_end(kcg *g, int esc);
 /* Reads a value: x * over / by, in steps. Returns 0 if it is not available.
    s: a row of the plan, or another row that refers to the plan. */

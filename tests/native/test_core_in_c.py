@@ -221,6 +221,18 @@ def test_a_large_energy_is_equal_in_both_cores_and_restarts_at_0(
         assert int.from_bytes(frame.data, "little") == tenths_of_wh % (1 << 32), core.language
 
 
+def test_a_frame_at_the_end_of_a_stream_is_found_but_not_processed(native_library: Any) -> None:
+    """Later calls do not process it either. In this stream a shorter frame follows a header."""
+    core = NativeCore(native_library, [EscSettings()], Layout("", "", ()), 0, False)
+    frame = encode(LiveData(battery_voltage=2400), WireLayout.LEGACY)
+    core.receive(0, b"KODI" + frame, SECOND, SECOND)
+    native_library.kcg_end(core.core, 0)
+    assert core.state.found_count == 1
+    core.advance(SECOND)
+    assert core.state.found_at == 0
+    assert core.escs[0].live is None
+
+
 def test_sorting_of_pending_messages_is_not_quadratic(tmp_path: Path) -> None:
     """Messages that became due earlier are marked last.
 
