@@ -45,6 +45,7 @@
 #define KCG_FOUND 2  /* UART frames of one kcg_receive that are stored before they are processed. */
 #endif
 enum { KCG_PAGES = 64 };
+enum { KCG_MOST_FRAMES = 100000000 }; /* The rate counts at most so many frames in a second. */
 #define KCG_NEVER INT64_MAX
 #define KCG_BYTE_NS (11 * INT64_C(1000000000) / 115200) /* A byte on the wire (8E1), in ns. */
 
