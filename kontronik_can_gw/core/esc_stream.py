@@ -32,6 +32,9 @@ from kontronik_can_gw.times import NEVER, SECOND
 
 _DEGRADED_BYTES_PER_DROPPED = 10
 """A link is degraded if more than one byte in this many is dropped."""
+_MOST_FRAMES = 100_000_000
+"""The rate counts at most so many live frames in a second. The core in C has the same limit, so
+that the rate stays in 32 bits."""
 # Members of an enumeration are slow to look up.
 _NEVER_SEEN = LinkState.NEVER_SEEN
 _OK = LinkState.OK
@@ -305,8 +308,9 @@ class EscStream(EscTelemetry):
         if not self.up:
             return Event.SECOND
         frames = new.live - old_frames
+        counted = min(frames, _MOST_FRAMES)
         # In 0.1 frames per second, rounded.
-        self.frame_rate = (20 * SECOND * frames + window_ns) // (2 * window_ns)
+        self.frame_rate = (20 * SECOND * counted + window_ns) // (2 * window_ns)
         if frames:
             self._interval_ns = window_ns // frames
         crc_errors = new.crc_errors - old_crc_errors

@@ -440,12 +440,11 @@ static int expire_esc(kcg_esc *e, int64_t now)
     return events;
 }
 
-/* Ends a second: computes the rate of live frames and the quality of the link. */
-static int close_window(kcg_esc *e, int64_t now)
+/* Ends a second of `length` ns: computes the rate of live frames and the quality of the link. */
+static int close_window(kcg_esc *e, int64_t now, int64_t length)
 {
     uint32_t new[4], *old = e->window;
     note_window(e, new);
-    int64_t length = now - e->window_ns;
     int64_t frames = new[LIVE_FRAMES] - old[LIVE_FRAMES];
     uint32_t bytes = new[BYTES] - old[BYTES];
     uint64_t dropped = new[DROPPED_BYTES] - old[DROPPED_BYTES];
@@ -459,6 +458,8 @@ static int close_window(kcg_esc *e, int64_t now)
         return KCG_SECOND;
     if (frames)
         e->interval = length / frames;
+    if (frames > KCG_MOST_FRAMES)
+        frames = KCG_MOST_FRAMES;
     e->rate = (int32_t)((20 * SECOND * frames + length) / (2 * length)); /* halves up */
     return KCG_SECOND | set_link(e, is_bad ? KCG_DEGRADED : KCG_OK);
 }
@@ -1525,8 +1526,9 @@ static void expire(kcg *g, int64_t now, int except)
         kcg_esc *e = &g->esc[i];
         if (i != except && now >= esc_deadline(g, e)) {
             int events = expire_esc(e, now);
-            if (now - e->window_ns >= SECOND)
-                events |= close_window(e, now);
+            int64_t length = now - e->window_ns;
+            if (length >= SECOND)
+                events |= close_window(e, now, length);
             report(g, i, events, now);
         }
     }
@@ -1601,10 +1603,10 @@ int kcg_next_event(kcg *g)
             if (g->mask & KCG_QUIET)
                 return KCG_QUIET;
         }
+        if (g->read_esc < 0)
+            return -1; /* frames that kcg_end found are not processed */
         if (accept_next(g))
             continue;
-        if (g->read_esc < 0)
-            return -1;
         kcg_esc *e = &g->esc[g->read_esc];
         if (e->link == KCG_NEVER_SEEN)
             report(g, g->read_esc, set_link(e, KCG_SEARCHING), g->read_now);

@@ -45,6 +45,7 @@
 #define KCG_FOUND 2  /* UART frames of one kcg_receive that are stored before they are processed. */
 #endif
 enum { KCG_PAGES = 64 };
+enum { KCG_MOST_FRAMES = 100000000 }; /* The rate counts at most so many frames in a second. */
 #define KCG_NEVER INT64_MAX
 #define KCG_BYTE_NS (11 * INT64_C(1000000000) / 115200) /* A byte on the wire (8E1), in ns. */
 
@@ -483,8 +484,8 @@ int kcg_slot_is_news(const kcg *g, uint32_t slot);
 int kcg_slot_is_pending(const kcg *g, uint32_t slot);
 uint64_t kcg_slot_sent(const kcg *g, uint32_t slot);
 #endif
-/* Decides the remaining bytes of a stream that has ended. Frames in them are stored in g->found,
-   but not processed. */
+/* Decides the remaining bytes of a stream that has ended. Frames in them are stored in g->found
+   until the next kcg_receive, but not processed. */
 void kcg_end(kcg *g, int esc);
 /* Reads a value: x * over / by, in steps. Returns 0 if it is not available.
    s: a row of the plan, or another row that refers to the plan. */

@@ -25,6 +25,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.binding import WrongObject, load
 from kontronik_can_gw.native.core import NativeCore
+from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.objects import OPTIONS
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.native.tables import Tables
@@ -219,6 +220,39 @@ def test_a_large_energy_is_equal_in_both_cores_and_restarts_at_0(
         (frame,) = core.take(0)
         tenths_of_wh = (mw_s + 180_000) // 360_000
         assert int.from_bytes(frame.data, "little") == tenths_of_wh % (1 << 32), core.language
+
+
+def test_a_frame_at_the_end_of_a_stream_is_found_but_not_processed(native_library: Any) -> None:
+    """Later calls do not process it either. In this stream a shorter frame follows a header."""
+    core = NativeCore(native_library, [EscSettings()], Layout("", "", ()), 0, False)
+    frame = encode(LiveData(battery_voltage=2400), WireLayout.LEGACY)
+    core.receive(0, b"KODI" + frame, SECOND, SECOND)
+    native_library.kcg_end(core.core, 0)
+    assert core.state.found_count == 1
+    core.advance(SECOND)
+    assert core.state.found_at == 0
+    assert core.escs[0].live is None
+
+
+@pytest.mark.parametrize("frames", [0, 99_999_998, 150_000_000, 2**32 - 3])
+def test_the_rate_counts_at_most_100_million_frames_in_a_second(
+    native_library: Any,
+    frames: int,
+) -> None:
+    """No UART carries so many. The limit keeps the rate of the core in C in 32 bits."""
+    esc = EscSettings(timeout_ns=2 * SECOND)
+    both = equality.Both(native_library, random.Random(1), [esc], Layout("", "", ()))
+    reading = encode(LiveData(battery_voltage=2400), WireLayout.V4)
+    both.call("receive", 0, reading, both.now, both.now)
+    python, native = both.python.escs[0], both.native.escs[0]
+    counters: Any = python.counters
+    counters.live_v4 += frames
+    native._state.count[KCG.N_LIVE_V4] += frames
+    both.now += SECOND
+    both.call("receive", 0, reading, both.now, both.now)
+    both.call("advance", both.now + 1)
+    assert python.frame_rate == native.frame_rate
+    assert python.frame_rate == pytest.approx(10 * min(frames + 1, 100_000_000), rel=1e-6)
 
 
 def test_sorting_of_pending_messages_is_not_quadratic(tmp_path: Path) -> None:
