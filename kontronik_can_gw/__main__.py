@@ -7,6 +7,10 @@ import sys
 if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
     _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
+# SIGUSR1 has no effect until cli/run.py sets its handler. It would end the process otherwise.
+if "run" in sys.argv[1:]:
+    _signal.signal(_signal.SIGUSR1, _signal.SIG_IGN)
+
 from kontronik_can_gw.cli import main
 
 if __name__ == "__main__":

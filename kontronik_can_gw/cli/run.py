@@ -104,17 +104,20 @@ class _Run:
 
     @contextmanager
     def _marking_on_signal(self) -> Iterator[None]:
-        """Let SIGUSR1 mark an event. Without ``record.on_event`` it has no effect."""
+        """Let SIGUSR1 mark an event. Without ``record.on_event`` it has no effect.
+
+        It is ignored before (see __main__.py) and afterwards, until the process has ended.
+        """
 
         def mark(_number: int, _frame: object) -> None:
             if self._recorder is not None:
                 self._recorder.mark()
 
-        before = signal.signal(signal.SIGUSR1, mark)
+        signal.signal(signal.SIGUSR1, mark)
         try:
             yield
         finally:
-            signal.signal(signal.SIGUSR1, before)
+            signal.signal(signal.SIGUSR1, signal.SIG_IGN)
 
     def _stop(self) -> None:
         self._is_stopping = True

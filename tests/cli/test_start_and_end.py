@@ -1,4 +1,4 @@
-"""Problems before a command begins: Ctrl-C while modules are loaded, and too few open files.
+"""Problems before a command begins or after it: signals, and too few open files.
 
 They never cause a traceback.
 """
@@ -20,7 +20,7 @@ class Interrupt:
     def find_spec(self, name, path, target=None):
         if name == {module!r}:
             sys.meta_path.remove(self)
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.{signal})
 
 for name in {loaded}:
     sys.modules.pop(name, None)
@@ -62,7 +62,13 @@ def test_ctrl_c_while_modules_are_loaded_ends_silently(
     start: str,
     folder: Path,
 ) -> None:
-    code = INTERRUPTED.format(module=module, words=words, start=start, loaded=["argparse"])
+    code = INTERRUPTED.format(
+        signal="SIGINT",
+        module=module,
+        words=words,
+        start=start,
+        loaded=["argparse"],
+    )
     done = run(sys.executable, "-c", code, folder=folder)
     assert (done.returncode, done.stderr) in ((-signal.SIGINT, ""), (130, ""))
 
@@ -70,10 +76,52 @@ def test_ctrl_c_while_modules_are_loaded_ends_silently(
 def test_an_ignored_ctrl_c_does_not_end_the_program(folder: Path) -> None:
     """Ctrl-C is ignored as in background jobs of a shell script."""
     code = "import signal; signal.signal(2, signal.SIG_IGN)\n" + INTERRUPTED
-    code = code.format(module="kontronik_can_gw.cli", words=["schema"], start=AS_MODULE, loaded=[])
+    code = code.format(
+        signal="SIGINT",
+        module="kontronik_can_gw.cli",
+        words=["schema"],
+        start=AS_MODULE,
+        loaded=[],
+    )
     done = run(sys.executable, "-c", code, folder=folder)
     assert done.returncode == 0
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize("start", [AS_MODULE, AS_PROGRAM])
+@pytest.mark.parametrize("module", ["kontronik_can_gw.cli", "argparse", "kontronik_can_gw.cli.run"])
+def test_signal_usr1_before_the_gateway_runs_does_not_end_it(
+    module: str,
+    start: str,
+    folder: Path,
+) -> None:
+    code = INTERRUPTED.format(
+        signal="SIGUSR1",
+        module=module,
+        words=["run", "-c", "missing.toml"],
+        start=start,
+        loaded=["argparse"],
+    )
+    done = run(sys.executable, "-c", code, folder=folder)
+    assert done.returncode == 2
+    assert done.stderr.startswith("kontronik-can-gw run: missing.toml: cannot be read")
+
+
+def test_signal_usr1_after_the_gateway_ran_does_not_kill_the_process(folder: Path) -> None:
+    code = (
+        "import atexit, os, signal\natexit.register(lambda: os.kill(os.getpid(), signal.SIGUSR1))\n"
+        + INTERRUPTED
+    )
+    code = code.format(
+        signal="SIGUSR1",
+        module="never loaded",
+        words=["run", "-c", "missing.toml"],
+        start=AS_MODULE,
+        loaded=[],
+    )
+    done = run(sys.executable, "-c", code, folder=folder)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
 
 
 def test_too_few_open_files_are_reported_in_one_line(folder: Path) -> None:
