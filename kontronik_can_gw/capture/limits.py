@@ -33,10 +33,16 @@ _LIMITS_OF_ESC = {
     "run_time": END_OF_TIME - 1,
     "losses": MAX_COUNT - 1,
 }
-_LATER_OF_ESC = ("late_frames", "suspect_frames", "line_errors")
+LATER_OF_ESC = ("late_frames", "suspect_frames", "line_errors")
 """Counters that captures before 0.6 do not have."""
-_WINDOW = ("window_ns", "live", "dropped_bytes", "bytes", "crc_errors", "rate", "interval_ns")
-"""Parts of ``EscTelemetry.window``."""
+_COUNT = (0, MAX_COUNT - 1)
+_LIMITS_OF_WINDOW = (
+    (0, END_OF_TIME - 1),
+    *(_COUNT, _COUNT, _COUNT, _COUNT),
+    (-1, (1 << 31) - 1),
+    (0, END_OF_TIME - 1),
+)
+"""Limits of the numbers of ``EscTelemetry.window``."""
 _LIMITS_OF_PLACE = (
     (0, 0xFFFF),
     (0, 0xFF),
@@ -60,14 +66,15 @@ def check_state(state: Mapping[str, Any]) -> None:
     for esc in state.get("escs", ()):
         for name, high in _LIMITS_OF_ESC.items():
             whole_number(esc[name], 0, high)
-        for name in _LATER_OF_ESC:
+        for name in LATER_OF_ESC:
             whole_number(esc.get(name, 0), 0, MAX_COUNT - 1)
         if "counters" in esc:
             whole_number(esc["held"], 0, _MAX_HELD)
-            _check_stream(esc["counters"], esc["window"])
+            for counter in esc["counters"]:
+                whole_number(counter, *_COUNT)
+            _check_numbers(esc["window"], _LIMITS_OF_WINDOW)
     for place in state.get("messages", ()):
-        for number, (low, high) in zip(place, _LIMITS_OF_PLACE, strict=True):
-            whole_number(number, low, high)
+        _check_numbers(place, _LIMITS_OF_PLACE)
     if "counters" in state:
         check_counters([whole_number(each, 0, END_OF_TIME) for each in state["counters"]])
     for name, high in _LIMITS_OF_GATEWAY.items():
@@ -75,12 +82,6 @@ def check_state(state: Mapping[str, Any]) -> None:
             whole_number(state[name], 0, high)
 
 
-def _check_stream(counters: Sequence[Any], window: Sequence[Any]) -> None:
-    for counter in counters:
-        whole_number(counter, 0, MAX_COUNT - 1)
-    for name, number in zip(_WINDOW, window, strict=True):
-        low = -1 if name == "rate" else 0
-        high = END_OF_TIME - 1 if name.endswith("_ns") else MAX_COUNT - 1
-        if name == "rate":
-            high = (1 << 31) - 1
+def _check_numbers(numbers: Sequence[Any], limits: Sequence[tuple[int, int]]) -> None:
+    for number, (low, high) in zip(numbers, limits, strict=True):
         whole_number(number, low, high)

@@ -16,7 +16,7 @@ from kontronik_can_gw.capture.format import (
     read_json,
     read_numbers,
 )
-from kontronik_can_gw.capture.limits import check_counters, check_state, check_time
+from kontronik_can_gw.capture.limits import LATER_OF_ESC, check_counters, check_state, check_time
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
@@ -186,7 +186,7 @@ class Replay:
             esc.energy_mw_ns = energy
             esc.run_time_ns = run_time
             esc.losses = losses
-            for name in ("late_frames", "suspect_frames", "line_errors"):
+            for name in LATER_OF_ESC:
                 setattr(esc, name, found.get(name, 0))
             if "counters" in found:
                 esc.adopt_stream_state(found["counters"], found["held"], found["window"])
