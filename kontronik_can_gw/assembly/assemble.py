@@ -243,17 +243,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
             *mute,
             *load_warning,
             *warnings,
-            *_without_folder(config),
         ),
         dbc=dbc.content,
         outputs=tuple(outputs),
     )
-
-
-def _without_folder(config: Config) -> Iterator[str]:
-    """Yield a warning if events are to be recorded, but only `run --record` gives a folder."""
-    if config.record.on_event and config.record.directory is None:
-        yield (
-            f"{config.file}: record.on_event: record.directory is not set, "
-            "so only `run --record DIR` records"
-        )

@@ -18,6 +18,7 @@ from kontronik_can_gw.config.keys import (
     CanConfig,
     Config,
     EscConfig,
+    RecordConfig,
     required,
 )
 from kontronik_can_gw.core.output_setup import OUTPUTS
@@ -105,7 +106,7 @@ def _make_config(
             escs[number] = esc
     config = None
     if not problems:
-        texts = [*removed, *_without_effect(made["can"])]
+        texts = [*removed, *_without_effect(made["can"], made["record"])]
         warnings = tuple(f"{file}: {text}" for text in texts)
         config = Config(
             **cast(Any, made),
@@ -205,13 +206,15 @@ def _is_ambiguous(name: str, starts: set[str]) -> bool:
     )
 
 
-def _without_effect(can: CanConfig) -> Iterator[str]:
-    """Yield a line for each key of [can] that has no effect with its interface."""
+def _without_effect(can: CanConfig, record: RecordConfig) -> Iterator[str]:
+    """Yield a line for each key that has no effect because of another key."""
     if can.restart_after_s and can.interface != "socketcan":
         yield (
             f"can.restart_after_s: has no effect with the interface {can.interface}, because only "
             "SocketCAN interfaces can be restarted"
         )
+    if record.on_event and record.directory is None:
+        yield "record.on_event: record.directory is not set, so only `run --record DIR` records"
 
 
 def _output_problems(config: Config) -> Iterator[str]:
