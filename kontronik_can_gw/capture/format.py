@@ -153,6 +153,11 @@ class Damage(NamedTuple):
     length: int
 
 
+def event_in_words(esc: str, reason: str) -> str:
+    """Return an event of an information block as text. ``esc`` may be empty."""
+    return f"{esc}: {reason}" if esc else reason
+
+
 class Packed(NamedTuple):
     """The payload of a block as it is stored."""
 

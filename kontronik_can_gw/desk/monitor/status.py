@@ -13,6 +13,7 @@ from typing import Any
 
 from rich.text import Text
 
+from kontronik_can_gw.capture.format import event_in_words
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.member import Alarm, Flag, alarms_of
 from kontronik_can_gw.desk.monitor.lines import (
@@ -406,7 +407,7 @@ def _events(recording: Document) -> Iterator[Text]:
         size = f"{recording['ring_bytes'] / 1e6:.1f} MB"
         yield line(f"recording waits for {awaited}, with {size} in memory")
     if event is not None:
-        about = f"{event['esc']}: {event['reason']}" if event["esc"] else event["reason"]
+        about = event_in_words(event["esc"], event["reason"])
         place = event["file"] or "not recorded yet"
         text = f"last event at {event['time']}: {about}, {place}"
         yield from wrapped(printable(text), "", _WIDTH)

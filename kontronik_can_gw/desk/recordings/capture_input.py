@@ -18,6 +18,7 @@ from kontronik_can_gw.capture.format import (
     EntryKind,
     Scanner,
     entry_at,
+    event_in_words,
     read_entries,
     read_json,
     read_numbers,
@@ -374,8 +375,8 @@ def _events_in_words(events: Any, begin_ns: int) -> str:
     with suppress(LookupError, TypeError):  # of a damaged header
         for event in events[:_MAX_EVENTS]:
             seconds = (event["time_ns"] - begin_ns) / SECOND
-            about = f"{event['esc']}: " if event["esc"] else ""
-            found.append(f"{about}{event['reason']} ({seconds:.1f} s)")
+            about = event_in_words(event["esc"], event["reason"])
+            found.append(f"{about} ({seconds:.1f} s)")
         if len(events) > _MAX_EVENTS:
             found.append(f"and {len(events) - _MAX_EVENTS} more")
     return printable(", ".join(found))

@@ -22,6 +22,7 @@ from kontronik_can_gw.capture.format import (
     EntryKind,
     Packed,
     data_payload,
+    event_in_words,
     json_payload,
     packed,
     read_json,
@@ -68,7 +69,7 @@ class RecordedEvent(NamedTuple):
 
     @property
     def in_words(self) -> str:
-        return f"{self.esc}: {self.reason}" if self.esc else self.reason
+        return event_in_words(self.esc, self.reason)
 
 
 @dataclass

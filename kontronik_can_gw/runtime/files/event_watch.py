@@ -1,8 +1,8 @@
 """Notices the events for which a capture is recorded.
 
-The core calls ``_follow`` with each change, in both languages. So an error bit is noticed even if
-it is set in a single frame, and a limit even if a single frame crosses it. Error bits and losses
-are looked at when they change. Conditions about live data make the core report each live frame.
+Both cores call ``_follow`` with each change. An error bit is therefore an event even if it is set
+in a single frame, and so is a limit that a single frame crosses. Without conditions about live data
+there is no call for a live frame that changes nothing else.
 """
 
 import time
@@ -72,7 +72,7 @@ class _Limit:
         self.condition = about
         self.value = value
         self.events = _EVENTS[value.pace or value.group]
-        """Events with which the value may have changed."""
+        """Events that may change the value."""
         self.forget()
 
     def forget(self) -> None:
@@ -140,7 +140,7 @@ class _Bits:
 
 
 class _WatchedEsc:
-    """What is remembered of one ESC."""
+    """One ESC, with its last words of error bits and the state of its conditions."""
 
     def __init__(self, state: EscTelemetry, config: RecordConfig) -> None:
         self.state = state
@@ -155,10 +155,10 @@ class _WatchedEsc:
         self._words = [_Bits(errors.get(word, ()), config.errors) for word in _WORDS]
         self._had_telemetry = False
         self.was_heard = False
-        """True after the ESC has sent live data."""
+        """True after the first live data."""
 
     def has_lost_telemetry(self) -> bool:
-        """Return True if live data was fresh at the last call, and is not any more."""
+        """Return True if live data has expired since the last call."""
         had_telemetry = self._had_telemetry
         self._had_telemetry = self.state.up
         self.was_heard |= self.state.up
