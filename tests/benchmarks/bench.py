@@ -27,6 +27,7 @@ BENCHMARKS = {
     "delay": live.delay,
     "delay-full": live.delay_full,
     "delay-busy": busy.delay_busy,
+    "delay-busy-workers": busy.delay_busy_workers,
     "offline-capture": offline.captures,
     "offline-log": offline.can_logs,
     "offline-bytes": offline.plain_bytes,
@@ -50,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
     option = parser.add_argument
     option("--only", nargs="+", default=["*"], metavar="NAME", help="these alone; as 'cpu*' too")
     option("--list", action="store_true", help="list the benchmarks and end")
-    option("--seconds", type=seconds, metavar="N", help="of one measurement (5, delay-busy 600)")
+    option("--seconds", type=seconds, metavar="N", help="of one measurement (5, delay-busy* 600)")
     option("--quick", action="store_true", help="as short as it can be: tries the benchmarks")
     args = parser.parse_args(arguments)
     if args.list:
