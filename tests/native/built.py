@@ -28,7 +28,8 @@ def there(program: str | None = None) -> str:
 
 def built(target: Path, *options: str, program: str | None = None) -> Path:
     """Compile the core as a shared object. Return its path."""
-    assert compile_core(target, options, there(program)) is None
+    problem = compile_core(target, options, there(program))
+    assert problem is None, problem
     return target
 
 

@@ -7,7 +7,7 @@ core. ``years_run.py`` runs ten years of virtual time in the same way.
 from typing import Any
 
 import pytest
-from years import WRAPS, RunInBoth, RunInC, Wrap, library
+from years import WRAPS, RunInBoth, RunInC, Wrap, build, load_both
 from years_run import main
 
 NAMES = [wrap.name for wrap in WRAPS]
@@ -15,7 +15,7 @@ NAMES = [wrap.name for wrap in WRAPS]
 
 @pytest.fixture(scope="module")
 def years_library(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return library(tmp_path_factory.mktemp("years"))
+    return load_both(build(tmp_path_factory.mktemp("years")))
 
 
 @pytest.mark.parametrize("wrap", WRAPS, ids=NAMES)

@@ -179,10 +179,14 @@ class Numbers(c.Structure):
     )
 
 
-def library(folder: Path) -> Any:
-    """Compile the core in C together with years.c, and return both."""
+def build(folder: Path) -> Path:
+    """Compile the core in C together with years.c. Return the path of both."""
     options = ("-O2", *OPTIONS, f"-I{FOLDER}", str(HERE / "years.c"))
-    path = built(folder / "years.so", *options)
+    return built(folder / "years.so", *options)
+
+
+def load_both(path: Path) -> Any:
+    """Load the core in C together with years.c. Return both."""
     found = load(path)
     together = c.CDLL(str(path))
     pointer = c.c_void_p

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from years import STEP_NS, WRAPS, YEAR_S, RunInC, Wrap, library
+from years import STEP_NS, WRAPS, YEAR_S, RunInC, Wrap, build, load_both
 
 from kontronik_can_gw.times import SECOND
 
@@ -46,11 +46,10 @@ def start_of(share: int, shares: int, length_s: float) -> int:
     return max(SECOND, middle - int(length_s / 2 * SECOND))
 
 
-def run_share(share: int, shares: int, years: float) -> int:
-    """Run a share of the years in this process. Return the exit code."""
+def run_share(share: int, shares: int, years: float, path: Path) -> int:
+    """Run a share of the years in this process, with a compiled core. Return the exit code."""
     steps = int(years * YEAR_S) * SECOND // STEP_NS // shares
-    with tempfile.TemporaryDirectory(prefix="kcg-years.") as folder:
-        run = RunInC(library(Path(folder)), start_of(share, shares, steps / 100))
+    run = RunInC(load_both(path), start_of(share, shares, steps / 100))
     parts = 1000
     first_kib = 0
     most_kib = 0
@@ -97,24 +96,31 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--years", type=float, default=10, help="years of virtual time, 0.0001 on")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--share", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--core", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args(words)
     if not 0.0001 <= args.years <= 100 or not 1 <= args.processes <= 8:
         parser.error("--years is 0.0001 to 100, and --processes 1 to 8")
     if args.share is not None:
-        return run_share(args.share, args.processes, args.years)
+        return run_share(args.share, args.processes, args.years, args.core)
     with tempfile.TemporaryDirectory(prefix="kcg-years.") as folder:
-        try:
-            for wrap in cross_in_c(library(Path(folder)), MINUTE_S):
-                print(f"crossed: {wrap.name}", flush=True)
-        except AssertionError as error:
-            print(error, file=sys.stderr)
-            return 1
+        return run_all(build(Path(folder)), args.processes, args.years)
+
+
+def run_all(path: Path, processes: int, years: float) -> int:
+    """Cross each wrap, then run the years in several processes. Return the exit code."""
+    try:
+        for wrap in cross_in_c(load_both(path), MINUTE_S):
+            print(f"crossed: {wrap.name}", flush=True)
+    except AssertionError as error:
+        print(error, file=sys.stderr)
+        return 1
     begin = time.monotonic()
-    command = [sys.executable, __file__, f"--years={args.years}", f"--processes={args.processes}"]
-    shares = [subprocess.Popen([*command, f"--share={share}"]) for share in range(args.processes)]
+    options = (f"--core={path}", f"--years={years}", f"--processes={processes}")
+    command = [sys.executable, __file__, *options]
+    shares = [subprocess.Popen([*command, f"--share={share}"]) for share in range(processes)]
     codes = [share.wait() for share in shares]
     print(
-        f"{args.years:g} years in {time.monotonic() - begin:.0f} s, 0 differences"
+        f"{years:g} years in {time.monotonic() - begin:.0f} s, 0 differences"
         if not any(codes)
         else "FAILED"
     )
