@@ -1,6 +1,10 @@
-"""`tests/vm/run` names `make test` when the set-up is missing, and finds the programs of .venv."""
+"""`tests/vm/run` names `make test` when the set-up is missing, and finds the programs of .venv.
+
+It runs a virtual machine on one CPU, and each on another one if possible.
+"""
 
 import os
+import subprocess
 import sys
 
 import pytest
@@ -57,3 +61,24 @@ def test_the_programs_of_the_venv_come_first(monkeypatch: pytest.MonkeyPatch) ->
     vm_run.extend_path()
     folders = ["/clone/.venv/bin", "/usr/bin", "/home/me/bin", "/usr/sbin", "/sbin", "/bin"]
     assert os.environ["PATH"].split(":") == folders
+
+
+def test_virtual_machines_take_the_cpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vm_run, "reserved", [])
+    cpus = {2001, 2002}  # no other virtual machine can have them
+    taken = [vm_run.reserved_cpu(cpus) for _ in range(5)]
+    assert taken == [2001, 2002, 2001, 2002, 2001]
+    vm_run.reserved[1].close()
+    assert vm_run.reserved_cpu(cpus) == 2002
+    for name in vm_run.reserved:
+        name.close()
+
+
+def test_a_virtual_machine_and_its_children_run_on_one_cpu() -> None:
+    before = os.sched_getaffinity(0)
+    code = "import os; print(len(os.sched_getaffinity(0)))"
+    with vm_run.on_one_cpu():
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    vm_run.reserved.pop().close()
+    assert done.stdout == b"1\n"
+    assert os.sched_getaffinity(0) == before

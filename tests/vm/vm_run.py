@@ -35,6 +35,7 @@ UML's children behind, so SIGTERM is sent first.
 import argparse
 import contextlib
 import glob
+import itertools
 import os
 import re
 import shlex
@@ -45,7 +46,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import BinaryIO, NoReturn
@@ -61,6 +62,8 @@ PASSED_ON = re.compile(
 )
 TMPFS = ("/tmp", "/var/tmp", "/run", "/dev/shm")  # guest-init.sh mounts an empty one on each
 
+MOST_ON_A_CPU = 16
+"""Most virtual machines of this computer that share a CPU."""
 UML_MEMORY_MIB = 512
 QEMU_MEMORY_MIB = 1024
 
@@ -293,6 +296,42 @@ def leave(number: int, _frame: FrameType | None) -> NoReturn:
     sys.exit(128 + number)
 
 
+reserved: list[socket.socket] = []
+"""The names of the CPUs that this process has reserved."""
+
+
+@contextlib.contextmanager
+def on_one_cpu() -> Iterator[None]:
+    """Let this process and its new children run on one CPU only, during the block.
+
+    User Mode Linux has several processes, and only one of them runs at a time. They take turns
+    several times faster on one CPU than on two.
+    """
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {reserved_cpu(before)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def reserved_cpu(cpus: Iterable[int]) -> int:
+    """Return the CPU with the fewest virtual machines, and count one more until this process ends.
+
+    Each is a name in the abstract namespace of sockets, so a killed process leaves nothing behind.
+    """
+    for place, cpu in itertools.product(range(MOST_ON_A_CPU), sorted(cpus)):
+        name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            name.bind(f"\0kontronik_can_gw vm {cpu} {place}")
+        except OSError:  # taken by another virtual machine
+            name.close()
+            continue
+        reserved.append(name)
+        return cpu
+    return min(cpus)
+
+
 def start_vm(
     backend: str,
     job: str,
@@ -331,15 +370,10 @@ def run_in_vm(
     try:
         write_job(job, backend, command, writable)
         pipes = [os.pipe() for _ in range(2)]
+        place = on_one_cpu() if backend == "uml" else contextlib.nullcontext()
         try:
-            with open(os.path.join(job, "log"), "wb") as log:
-                process = start_vm(
-                    backend,
-                    job,
-                    pipes[0][1],
-                    pipes[1][1],
-                    log,
-                )
+            with open(os.path.join(job, "log"), "wb") as log, place:
+                process = start_vm(backend, job, pipes[0][1], pipes[1][1], log)
         finally:
             for _, end in pipes:
                 os.close(end)
