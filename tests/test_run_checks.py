@@ -133,3 +133,12 @@ def test_every_step_is_in_one_tier_and_every_marker_is_run() -> None:
                 chosen.append(found[1])
         assert sorted(chosen) == ["extended", "not extended"]
     assert "-m 'extended or rights'" in checks.STEPS["tools"], "CI runs this one as root"
+
+
+def test_a_step_may_take_as_long_as_the_page_about_proofs_says() -> None:
+    page = (checks.PROJECT / "docs" / "proof.md").read_text(encoding="utf-8")
+    row = r"^\| `make release ARGS=\"--only (\w+)\".*\| (\d+) hours \|$"
+    rows = re.findall(row, page, re.MULTILINE)
+    assert dict(rows) == {"years": "9"}
+    for step, hours in rows:
+        assert checks.limit_s("release", step) >= 2 * 3600 * int(hours), "a slower machine, too"

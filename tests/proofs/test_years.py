@@ -4,6 +4,8 @@ The oracle in years.c computes each CAN frame from exact integers of its own, an
 core. ``years_run.py`` runs ten years of virtual time in the same way.
 """
 
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +18,11 @@ NAMES = [wrap.name for wrap in WRAPS]
 @pytest.fixture(scope="module")
 def years_library(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return load_both(build(tmp_path_factory.mktemp("years")))
+
+
+def test_the_page_about_proofs_states_the_number_of_wraps() -> None:
+    page = Path(__file__).parents[2].joinpath("docs", "proof.md").read_text(encoding="utf-8")
+    assert re.findall(r"\| (\d+) wraps \|", page) == 2 * [str(len(WRAPS))]
 
 
 @pytest.mark.parametrize("wrap", WRAPS, ids=NAMES)
@@ -44,7 +51,7 @@ def test_a_run_without_jumps_crosses_the_end_of_charge_energy_and_positions(
     assert run.oracle.numbers.losses == 2
 
 
-@pytest.mark.parametrize("words", [["--years=0"], ["--years=1e9"], ["--processes=0"]])
+@pytest.mark.parametrize("words", [["--years=0"], ["--years=1e9"], ["--processes=1"]])
 def test_a_length_out_of_range_is_refused_in_one_line(
     words: list[str],
     capsys: pytest.CaptureFixture[str],
@@ -52,4 +59,4 @@ def test_a_length_out_of_range_is_refused_in_one_line(
     with pytest.raises(SystemExit) as ended:
         main(words)
     assert ended.value.code == 2
-    assert "--years is 0.0001 to 100, and --processes 1 to 8" in capsys.readouterr().err
+    assert "--years is 0.0001 to 100, and --processes 2 to 8" in capsys.readouterr().err

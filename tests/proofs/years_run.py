@@ -38,7 +38,7 @@ def start_of(share: int, shares: int, length_s: float) -> int:
     """Return the time at which a share of the run begins.
 
     The first one begins with the clock, the second one crosses 2^31 s in its middle, and others
-    cross 2^53 ns, 2^54 ns and so on.
+    cross 2^53 ns, 2^54 ns and so on. So there must be two of them at least.
     """
     if share == 0:
         return SECOND
@@ -94,12 +94,12 @@ def main(words: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--years", type=float, default=10, help="years of virtual time, 0.0001 on")
-    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--processes", type=int, default=min(max(2, os.cpu_count() or 2), 8))
     parser.add_argument("--share", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--core", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args(words)
-    if not 0.0001 <= args.years <= 100 or not 1 <= args.processes <= 8:
-        parser.error("--years is 0.0001 to 100, and --processes 1 to 8")
+    if not 0.0001 <= args.years <= 100 or not 2 <= args.processes <= 8:
+        parser.error("--years is 0.0001 to 100, and --processes 2 to 8")
     if args.share is not None:
         return run_share(args.share, args.processes, args.years, args.core)
     with tempfile.TemporaryDirectory(prefix="kcg-years.") as folder:
