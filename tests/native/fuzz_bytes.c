@@ -120,7 +120,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
             break;
         case 4: kcg_stop(g, now); break;
         case 5: follow(g, kcg_expire(g, now)); break;
-        case 6: kcg_end(g, esc); break;
+        case 14: kcg_end(g, esc); break;
         default: receive(g, esc, now);
         }
         follow(g, kcg_advance(g, now));

@@ -76,6 +76,11 @@ void other(int which, int64_t now)
     case 1: kcg_gateway_changed(g, 0, now); break;
     case 2: kcg_port(g, 0, 0, now); break;
     case 3: kcg_port(g, 0, 1, now); break;
-    default: kcg_apply(g, 0, settings);
+    case 4: kcg_apply(g, 0, settings); break;
+    case 5: kcg_expire(g, now); break;
+    case 6: kcg_next_event(g); break;
+    case 7: kcg_next_deadline(g); break;
+    case 8: kcg_end(g, 0); break;
+    default: kcg_stop(g, now);
     }
 }

@@ -31,6 +31,8 @@ SHORTEST = 38
 LONGEST = 44
 HELD = LONGEST - 1
 HEADER = 4
+STORED = 2
+"""KCG_FOUND of the exported core."""
 LONGEST_CRCS = 40 + 34 + 4
 """Passes of the CRC's loop for one header: both forms, the longer CRC, the ends of the loops."""
 
@@ -208,7 +210,7 @@ class Limits:
         if size <= LONGEST:
             scans.pop()
         scanned = sum(scans)
-        frames = min(most_frames, scanned // SHORTEST)
+        frames = min(most_frames, (HELD + size) // SHORTEST)
         headers = sum(max(0, bytes_ - SHORTEST) // HEADER + 1 for bytes_ in scans)
         turns = sum(bytes_ // (HEADER - 1) + 2 for bytes_ in scans)
         return self._sum(
@@ -240,10 +242,7 @@ class Limits:
         return self._sum(self._own["sent"], packs=1, pack=self.plan.on_change)
 
     def other(self) -> int:
-        """Return the limit of the calls that the owner makes now and then.
-
-        These are kcg_repeat, kcg_gateway_changed, kcg_port and kcg_apply.
-        """
+        """Return the limit of all other calls, except kcg_init."""
         scan = HELD
         turns = scan // (HEADER - 1) + 2
         return self._sum(
@@ -253,9 +252,11 @@ class Limits:
             drop=scan + 2 * turns,
             memchr=scan + 2 * turns,
             header_at=scan + turns,
-            accept=2,
+            accept=STORED + 1,
             report=1,
-            reports=3,
+            # expired values of each ESC, each stored frame, the state of the link, the gateway's
+            # second
+            reports=self.plan.escs + STORED + 2,
         )
 
     def stated(self) -> dict[str, int]:
@@ -272,9 +273,12 @@ class Limits:
             "`kcg_receive`: each call": call,
             "`kcg_receive`: each byte": byte,
             "`kcg_receive`: each UART frame that ends in it": frame,
+            "`kcg_receive` of one byte": self.receive(1),
+            "`kcg_receive` of 256 bytes": self.receive(MOST_BYTES),
             "`kcg_advance`": self.advance(),
             "`kcg_take` of all messages": self.take(),
             "`kcg_sent` of all messages": self.sent(),
+            "each other call, except `kcg_init`": self.other(),
         }
 
     def lines(self) -> list[str]:
