@@ -80,6 +80,20 @@ def read_entries(log: memoryview, at: int = SECTOR) -> tuple[list[Entry], int]:
     return entries, at
 
 
+def entries_before(log: memoryview, at: int, mark: Entry) -> tuple[list[Entry], int] | None:
+    """Return the entries from a position to a mark, and the position behind the mark.
+
+    None if the kernel has not written the mark yet. The kernel writes the head of an entry earlier
+    than its content, but all of it before the next entry. So the entries are read a second time
+    when the mark is there.
+    """
+    entries, _ = read_entries(log, at)
+    if mark not in entries:
+        return None
+    entries, behind = read_entries(log, at)
+    return entries[: entries.index(mark)], behind
+
+
 class State(NamedTuple):
     """The content of the device after a loss of power behind entry ``at``.
 

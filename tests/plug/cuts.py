@@ -5,12 +5,20 @@
 ``power_cuts.py`` runs it in User Mode Linux. The gateway runs on a logged device. Each state
 that a loss of power may leave is mounted and judged, and the recorder starts in it. Every tenth
 state loses power a second time while it is mounted and used again. In every 100th state `run`
-itself starts. DIR gets ``FILESYSTEM.json`` with the figures. The exit code is 1 if a state is bad.
+itself starts. The exit code is 1 if a state is bad. DIR gets
+
+* ``FILESYSTEM.json`` with the figures,
+* ``FILESYSTEM.recorded.gz`` with the log. ``--recorded`` examines it again, because a further run
+  of the gateway has another log, also with the same seed.
+* ``FILESYSTEM-N.img.gz`` with the disk of each bad state, for a mount or `dump.f2fs`.
 """
 
 import argparse
+import gzip
 import json
+import pickle
 import random
+import shutil
 import subprocess
 import sys
 import time
@@ -57,6 +65,7 @@ class Examiner:
         self._log_device = LoopDevice(2, MEMORY / "second", 64 << 20)
         self._device = LoggedDevice("examined", disk, self._log_device)
         self._real = RealStart(system)
+        self.kind = system.kind
         self.image = Image(disk)
         self.rescued = 0
         """Number of second losses of power after which only a repair allowed to mount."""
@@ -96,6 +105,12 @@ class Examiner:
             if entry.is_write:
                 self.image.note_changed(entry.sector, len(entry.data))
         return verdict, log
+
+    def keep(self, writes: tuple[Write, ...], file: Path) -> None:
+        """Write the disk of the state with these writes to a compressed file."""
+        self.image.put(writes)
+        with (MEMORY / "disk").open("rb") as disk, gzip.open(file, "wb", 1) as stream:
+            shutil.copyfileobj(disk, stream)
 
     def _mount(self, is_second: bool) -> None:
         """Mount the device as a system does that boots."""
@@ -148,23 +163,27 @@ def last_words_of_the_kernel() -> str:
 
 
 class Tally:
-    """Counts states and describes the bad ones."""
+    """Counts states, describes the bad ones and keeps their disks."""
 
-    def __init__(self) -> None:
+    def __init__(self, examiner: Examiner, folder: Path) -> None:
+        self._examiner = examiner
+        self._folder = folder
         self.counts: Counter[str] = Counter()
         self.bad = 0
         self.shown: list[str] = []
         """Descriptions of the first bad states."""
         self.loss_ns = 0
 
-    def add(self, kind: str, state: State, verdict: Verdict) -> None:
+    def add(self, kind: str, state: State, writes: tuple[Write, ...], verdict: Verdict) -> None:
         self.counts[kind] += 1
         self.loss_ns = max(self.loss_ns, verdict.loss_ns)
         if verdict.problems:
             self.bad += 1
             if self.bad <= SHOWN:
-                head = f"BAD {kind} {state.kind} at entry {state.at}, flushed {state.base}:"
-                self.shown.append("\n    ".join([head, *verdict.problems]))
+                file = self._folder / f"{self._examiner.kind}-{self.bad}.img.gz"
+                self._examiner.keep(writes, file)
+                head = f"BAD {kind} {state.kind} at entry {state.at}, flushed {state.base}"
+                self.shown.append("\n    ".join([f"{head}, {file.name}:", *verdict.problems]))
                 print(self.shown[-1], flush=True)
 
     @property
@@ -186,9 +205,10 @@ def examine_all(
     recorded: Recorded,
     states: list[State],
     generator: random.Random,
+    folder: Path,
 ) -> Tally:
     """Examine the states in the order of the log, and second losses of power in some of them."""
-    tally = Tally()
+    tally = Tally(examiner, folder)
     flushed: Verdict | None = None
     base = 0
     for number, state in enumerate(states):
@@ -198,16 +218,34 @@ def examine_all(
             base = state.base
         with_run = number % START_EVERY == 0
         verdict, log = examiner.examine(state, state.writes, flushed, with_run=with_run)
-        tally.add(state.kind, state, verdict)
+        tally.add(state.kind, state, state.writes, verdict)
         if state.kind == "prefix" and state.at == state.base:
             flushed = verdict
         if number % SECOND_CUT_EVERY == 0 and not verdict.problems:
             for writes in second_cuts(state, log, generator):
                 again, _ = examiner.examine(state, writes, verdict, is_second=True)
-                tally.add("second", state, again)
+                tally.add("second", state, writes, again)
         if number % max(1, len(states) // 20) == 0:
             print(f"{number} of {len(states)} states, {tally.bad} bad", flush=True)
     return tally
+
+
+def recorded_gateway(
+    system: FileSystem,
+    disk: LoopDevice,
+    args: argparse.Namespace,
+) -> tuple[bytes, Recorded]:
+    """Return the empty file system and the log of a gateway, which a file may have."""
+    if args.recorded:
+        with gzip.open(args.recorded) as stream:
+            found: tuple[bytes, Recorded] = pickle.load(stream)
+            return found
+    make_file_system(system, disk)
+    empty = (MEMORY / "disk").read_bytes()
+    recorded = record(system, disk, args.seed)
+    with gzip.open(args.folder / f"{system.kind}.recorded.gz", "wb", 1) as stream:
+        pickle.dump((empty, recorded), stream)
+    return empty, recorded
 
 
 def main() -> int:
@@ -218,15 +256,14 @@ def main() -> int:
     parser.add_argument("--states", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--recorded", type=Path)
     args = parser.parse_args()
     system = FILE_SYSTEMS[args.system]
     load_modules()
     for folder in (ROOT, MEMORY):
         folder.mkdir()
     disk = LoopDevice(0, MEMORY / "disk", system.size)
-    make_file_system(system, disk)
-    empty = (MEMORY / "disk").read_bytes()
-    recorded = record(system, disk, args.seed)
+    empty, recorded = recorded_gateway(system, disk, args)
     (MEMORY / "disk").open("r+b").write(empty)
     generator = random.Random(args.seed)
     share = 1 + SECOND_CUTS / SECOND_CUT_EVERY
@@ -237,7 +274,7 @@ def main() -> int:
         flush=True,
     )
     examiner = Examiner(system, disk, recorded)
-    tally = examine_all(examiner, recorded, states, generator)
+    tally = examine_all(examiner, recorded, states, generator, args.folder)
     figures = {
         "states": tally.total,
         "kinds": tally.counts,

@@ -12,7 +12,7 @@ import subprocess
 import time
 from pathlib import Path
 
-from block_log import SECTOR, Entry, Write, read_entries
+from block_log import SECTOR, Entry, Write, entries_before
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _LOOP_SET_FD = 0x4C00
@@ -119,14 +119,14 @@ class LoggedDevice:
         self._marks += 1
         last = Entry(data=f"end={self._marks}".encode(), is_mark=True)
         self.mark(last.data.decode())
-        entries: list[Entry] = []
-        while not entries or entries[-1] != last:
+        while True:
             with memoryview(self._map) as view:
-                more, self._at = read_entries(view, self._at)
-            entries += more
-            if not more:
-                time.sleep(_DELAY_S)
-        return entries[:-1]
+                found = entries_before(view, self._at, last)
+            if found is not None:
+                break
+            time.sleep(_DELAY_S)
+        entries, self._at = found
+        return entries
 
     @property
     def is_nearly_full(self) -> bool:

@@ -142,6 +142,9 @@ def judge_statistics(verdict: Verdict, file: Path) -> None:
         data = file.read_bytes()
     except FileNotFoundError:
         return
+    except OSError as error:
+        verdict.problems.append(f"statistics: {error}")
+        return
     try:
         is_whole = data.endswith(b"}\n") and json.loads(data)["program"] == PROGRAM
     except (ValueError, KeyError, TypeError):

@@ -3,8 +3,9 @@
 import random
 import struct
 
+import block_log
 import pytest
-from block_log import SECTOR, Entry, Log, State, Write, read_entries, torn
+from block_log import SECTOR, Entry, Log, State, Write, entries_before, read_entries, torn
 
 A, B, C, D = (letter * SECTOR for letter in (b"a", b"b", b"c", b"d"))
 FLUSH = Entry(is_flush=True)
@@ -55,6 +56,30 @@ def test_a_log_of_the_kernel_is_read_up_to_its_end() -> None:
     ]
     assert at == len(log)
     assert read_entries(memoryview(log + bytes(SECTOR)), at) == ([], at)
+
+
+def test_entries_without_a_mark_behind_them_are_not_returned() -> None:
+    log = record(8, 2, 0, A + B) + record(0, 0, 8, b"end=1", 5) + bytes(SECTOR)
+    with memoryview(log) as view:
+        assert entries_before(view, 0, mark("end=1")) == ([Entry(8, A + B)], 4 * SECTOR)
+        assert entries_before(view, 0, mark("end=2")) is None
+
+
+def test_content_that_is_written_after_its_head_is_read_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole = record(8, 2, 0, A + B) + record(0, 0, 8, b"end=1", 5) + bytes(SECTOR)
+    log = bytearray(whole)
+    log[SECTOR : 3 * SECTOR] = bytes(2 * SECTOR)
+
+    def read_while_the_kernel_writes(view: memoryview, at: int) -> tuple[list[Entry], int]:
+        found = read_entries(view, at)
+        log[:] = whole
+        return found
+
+    monkeypatch.setattr(block_log, "read_entries", read_while_the_kernel_writes)
+    with memoryview(log) as view:
+        assert entries_before(view, 0, mark("end=1")) == ([Entry(8, A + B)], 4 * SECTOR)
 
 
 @pytest.mark.parametrize(

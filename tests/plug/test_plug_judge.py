@@ -151,6 +151,12 @@ def test_statistics_must_be_whole_or_missing(
     assert (verdict.problems == []) == is_good
 
 
+def test_statistics_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
+    verdict = Verdict()
+    judge_statistics(verdict, tmp_path)
+    assert "statistics: [Errno" in "".join(verdict.problems)
+
+
 def test_a_start_records_in_a_new_or_an_old_folder(tmp_path: Path) -> None:
     verdict = Verdict()
     judge_start(verdict, tmp_path / "captures")
