@@ -403,7 +403,8 @@ extern "C" {
    2. Calls do not overlap: use one context, and make no call from an interrupt during another call.
    3. `now` is in nanoseconds, 0 <= now < 2^61, and never less than in an earlier call.
    4. `esc` is the number of an ESC of the plan, from 0.
-   5. After a function that returns an event, call kcg_next_event until it returns -1, before any
+   5. The owner writes only counts from 0 to 2^48 and the states of its enums to `gateway`.
+   6. After a function that returns an event, call kcg_next_event until it returns -1, before any
       other call. With `mask` 0, its value after kcg_init, functions return -1 and this is not
       needed.
 
@@ -414,8 +415,8 @@ size_t kcg_size(const kcg_plan *plan);
 /* Starts a core and returns `memory`. Call it again to restart the core.
    memory: kcg_size bytes, aligned for int64_t. Afterwards only the core may write them, except
    `mask` and `gateway` (see kcg).
-   settings: one for each ESC, with timeout > 0, poles >= 1 and both parts of the gear >= 1. They
-   are copied. */
+   settings: one for each ESC, with 0 < timeout < 2^61, poles from 1 to 255, and both parts of the
+   gear from 1 to 2^20 - 1. They are copied. */
 kcg *kcg_init(void *memory, const kcg_plan *plan, const kcg_settings *settings, int64_t now);
 
 /* A bit in the result of kcg_receive. */
