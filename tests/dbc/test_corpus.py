@@ -1,4 +1,4 @@
-"""118 DBCs of real cars (opendbc), each with each of its nodes.
+"""The DBCs of real cars in opendbc, each with each of its nodes.
 
 All refusals are plain lines, and the remaining messages are sent as cantools reads them. The test
 does the same as a user: it binds signals by their unit, sends start values in all others, and

@@ -34,6 +34,9 @@ from kontronik_can_gw.signals.plan import Layout, Piece
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
+IS_FLOAT = "a float"
+IS_CRC = "a CRC: only its place and its numbers are compared"
+"""Reasons why a signal is not proven. The third one is that the solver gave up."""
 _FLOAT_END = 1 << 62
 """The core in C divides smaller numbers for a float (core.c, quotient)."""
 
@@ -163,7 +166,7 @@ class Prover:
             return
         if rule.shape is Shape.CRC:
             yield from _wrong_crc(signal, plan)
-            reasons.append("a CRC: only its place and its numbers are compared")
+            reasons.append(IS_CRC)
             return
         found = [each for each in plan.signals if _is_on(each, signal)]
         if len(found) != 1:
@@ -183,7 +186,7 @@ class Prover:
             yield overflow
             return
         if rule.shape is Shape.FLOAT:
-            reasons.append("a float")
+            reasons.append(IS_FLOAT)
             return
         if planned.planned.is_float:
             yield "is sent as a float"
