@@ -15,7 +15,7 @@ Everything here is pure.
 import random
 import struct
 from bisect import bisect_left, bisect_right
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 SECTOR = 512
@@ -110,19 +110,12 @@ class State(NamedTuple):
 class Log:
     """The entries of a log, and the facts about each position in it.
 
-    A write reaches the device in units of ``unit`` bytes. The sectors ``whole`` reach it together
-    or not at all.
+    A write reaches the device in units of ``unit`` bytes.
     """
 
-    def __init__(
-        self,
-        entries: Sequence[Entry],
-        unit: int = SECTOR,
-        whole: Collection[int] = (),
-    ) -> None:
+    def __init__(self, entries: Sequence[Entry], unit: int = SECTOR) -> None:
         self.entries = list(entries)
         self._unit = unit
-        self._whole = frozenset(whole)
         self._flushes = [i for i, each in enumerate(entries) if each.is_flush]
         self._barriers = [i for i, each in enumerate(entries) if each.is_barrier]
         self._marks: dict[str, tuple[list[int], list[int]]] = {}
@@ -184,10 +177,7 @@ class Log:
             if each.is_durable and each is not under_way:
                 writes.append((each.sector, each.data))
             elif tears and generator.random() < 0.5:
-                parts = torn(each, self._unit, generator)
-                reached = self._whole.intersection(sector for sector, _ in parts)
-                is_whole = reached == self._whole
-                writes += [part for part in parts if is_whole or part[0] not in reached]
+                writes += torn(each, self._unit, generator)
             elif generator.random() >= share:
                 writes.append((each.sector, each.data))
         if under_way is not None and under_way.is_durable:

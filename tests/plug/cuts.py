@@ -68,7 +68,7 @@ class Examiner:
         self.kind = system.kind
         self.image = Image(disk)
         self.rescued = 0
-        """Number of second losses of power after which only a repair allowed to mount."""
+        """Number of states that the kernel mounted only after a repair."""
         self.undone = 0
         """Number of second losses of power that undid flushed writes of captures."""
 
@@ -92,7 +92,7 @@ class Examiner:
         self.image.put(writes)
         verdict = Verdict()
         try:
-            self._mount(is_second)
+            self._mount(may_be_repaired=is_second or state.kind == "torn")
         except OSError as error:
             verdict.problems.append(f"does not mount: {error}; {last_words_of_the_kernel()}")
         else:
@@ -100,7 +100,7 @@ class Examiner:
             if with_run and (problem := self._real.problem()):
                 verdict.problems.append(problem)
             unmount(ROOT)
-        log = Log(self._device.entries(), self._system.unit, self._system.whole)
+        log = Log(self._device.entries(), self._system.unit)
         for entry in log.entries:
             if entry.is_write:
                 self.image.note_changed(entry.sector, len(entry.data))
@@ -112,7 +112,7 @@ class Examiner:
         with (MEMORY / "disk").open("rb") as disk, gzip.open(file, "wb", 1) as stream:
             shutil.copyfileobj(disk, stream)
 
-    def _mount(self, is_second: bool) -> None:
+    def _mount(self, may_be_repaired: bool) -> None:
         """Mount the device as a system does that boots."""
         system = self._system
         if system.repair:
@@ -120,7 +120,7 @@ class Examiner:
         try:
             mount(self._device.path, ROOT, system.kind)
         except OSError:
-            if not (is_second and system.rescue):
+            if not (may_be_repaired and system.rescue):
                 raise
             self.rescued += 1
             self._repair(system.rescue)

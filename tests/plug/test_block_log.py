@@ -141,18 +141,6 @@ def test_a_torn_write_reaches_the_device_in_whole_units(unit: int) -> None:
     assert {part for found in seen for part in found} == set(parts)
 
 
-def test_sectors_that_are_never_torn_reach_the_device_together() -> None:
-    log = Log([Entry(1, A + B + C + D)], whole=(2, 3))
-    generator = random.Random(1)
-    seen = {log.variant(1, generator).writes for _ in range(500)}
-    whole = ((1, A + B + C + D),)
-    sectors = {frozenset(sector for sector, _ in writes) for writes in seen if writes != whole}
-    assert sectors == {frozenset(found) for found in ([], [1], [4], [1, 4], *PAIRED)}
-
-
-PAIRED = ([2, 3], [1, 2, 3], [2, 3, 4], [1, 2, 3, 4])
-
-
 @pytest.mark.parametrize("count", [2, 6, 40])
 def test_states_come_in_the_order_of_the_log_each_base_first(count: int) -> None:
     states = LOG.states(count, random.Random(1))
