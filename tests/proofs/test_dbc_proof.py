@@ -42,9 +42,9 @@ LIST = PROJECT / "tests/mutants/plan_faults.toml"
 LIMIT_S = 300
 
 
-def configuration(folder: Path, dbc: str = "") -> Path:
-    """Write a configuration with one of the DBCs of this folder."""
-    text = EVERY_RULE
+def configuration(folder: Path, dbc: str = "", keys: str = "") -> Path:
+    """Write a configuration with one of the DBCs of this folder, and further keys of [dbc]."""
+    text = EVERY_RULE + keys
     if dbc:
         text = text.replace("every_rule.dbc", dbc)
     return written(folder / "gateway.toml", text)
@@ -124,6 +124,32 @@ def test_an_e2e_message_is_proven_except_the_computation_of_its_crc(
     assert {"M.M_BZ", "M.BatteryVoltage"} <= {*found["proven"]}
 
 
+@pytest.mark.parametrize(
+    ("keys", "signals"),
+    [
+        ("", {"Gateway.Uptime", "LeftMotor.LeftBatteryVoltage", "RightMotor.RightBatteryVoltage"}),
+        ("base_id = 0x300\nid_step = 8", {"Gateway.Uptime"}),
+        ('messages = ["Gateway"]', {"Gateway.Uptime"}),
+        ('bind = {BatteryVoltage = "left.battery_voltage"}', {"EscMotor.BatteryVoltage"}),
+    ],
+)
+def test_copies_for_several_escs_are_proven(tmp_path: Path, keys: str, signals: set[str]) -> None:
+    found = proof_of(configuration(tmp_path, "copied.dbc", keys))
+    assert found["refuted"] == []
+    assert signals <= {*found["proven"]}
+
+
+def test_chosen_messages_without_a_transmitter_are_proven(tmp_path: Path) -> None:
+    text = Path(__file__).with_name("copied.dbc").read_text()
+    for node in ("KontronikGateway", "Other"):
+        text = text.replace(f": 8 {node}\n", ": 8 Vector__XXX\n")
+    dbc = written(tmp_path / "no_node.dbc", text)
+    keys = f'[dbc]\nfile = "{dbc}"\nmessages = ["EscMotor"]\n'
+    found = proof_of(written(tmp_path / "gateway.toml", ONE_ESC + keys))
+    assert found["refuted"] == []
+    assert found["proven"] == ["EscMotor.BatteryVoltage"]
+
+
 def test_a_layout_that_only_python_can_send_is_proven_for_python(tmp_path: Path) -> None:
     path = configuration(tmp_path, "wide.dbc")
     found = proof_of(path)
@@ -143,13 +169,15 @@ class PlanFault:
     fault: Fault
     refuted_as: str
     dbc: str
+    keys: str
 
 
 def plan_faults() -> list[PlanFault]:
     found = []
     for each in tomllib.loads(LIST.read_text())["fault"]:
         fault = Fault(each["what"], each["search"], each["replace"], ())
-        found.append(PlanFault(fault, each["refuted_as"], each.get("dbc", "")))
+        dbc, keys = each.get("dbc", ""), each.get("keys", "")
+        found.append(PlanFault(fault, each["refuted_as"], dbc, keys))
     return found
 
 
@@ -169,7 +197,7 @@ def test_a_fault_of_the_compiler_is_refuted(each: PlanFault, copy: Path, tmp_pat
     file, changed = each.fault.put_in(copy)
     whole = file.read_text()
     file.write_text(changed)
-    words = ["check", "--prove", "--json", str(configuration(tmp_path, each.dbc))]
+    words = ["check", "--prove", "--json", str(configuration(tmp_path, each.dbc, each.keys))]
     try:
         done = subprocess.run(
             [sys.executable, "-m", "kontronik_can_gw", *words],

@@ -1,9 +1,10 @@
 """The frames that a DBC defines, derived from its physical values as exact fractions.
 
 This is the specification of the proof. The rest of the package supplies only the user's input: the
-DBC as cantools reads it, the names to which signals bind, and the spellings of
-units. Limits, codes, factors and bit positions are derived here a second time, from the text of
-docs/dbc.md and docs/your-own-dbc.md.
+DBC as cantools reads it, the names to which signals bind, the roles of counters and CRCs, E2E
+profiles and data ids, and the spellings of units. Limits, codes, factors and bit positions are
+derived here a second time, from the text of docs/dbc.md and docs/your-own-dbc.md. Messages, CAN ids
+and the ESC of each copy are derived in messages.py.
 """
 
 import struct
@@ -14,13 +15,12 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.e2e_attributes import role_of
-from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.names import Binder, is_data_id, protection
 from kontronik_can_gw.dbc.protection import stated_data_ids, stated_profile
-from kontronik_can_gw.dbc.reader import attribute, choose_node
+from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.desk.proof.end_to_end import COUNTERS, CrcRule, expected_rule
+from kontronik_can_gw.desk.proof.messages import SentMessage, sent_messages
 from kontronik_can_gw.desk.proof.quantities import QUANTITIES, Quantity, size
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
@@ -135,36 +135,34 @@ class ExpectedMessage:
 
 
 def expected_messages(
-    database: "Database", file: str, escs: Sequence[EscSettings], settings: DbcConfig
+    database: "Database", escs: Sequence[EscSettings], settings: DbcConfig
 ) -> Iterator[ExpectedMessage]:
     """Yield the messages of the gateway in the order of the file."""
-    node = choose_node(database, settings.node, file, settings.messages)
     binder = Binder(escs, settings.bind)
-    for copy in copies_of(database, file, escs, settings):
-        if node in copy.message.senders:
-            yield _message(database, copy, binder, settings)
+    for sent in sent_messages(database, escs, settings):
+        yield _message(database, sent, binder, settings)
 
 
 def _message(
-    database: "Database", copy: Copy, binder: Binder, settings: DbcConfig
+    database: "Database", sent: SentMessage, binder: Binder, settings: DbcConfig
 ) -> ExpectedMessage:
-    message = copy.message
+    message = sent.message
     pages: set[int] = set()
     for signal in message.signals:
         pages.update(signal.multiplexer_ids or ())
     multiplexer: tuple[int, ...] = ()
     signals = []
-    protection = _protection(database, copy, binder, settings)
+    protection = _protection(database, sent, binder, settings)
     for signal in message.signals:
         if signal.is_multiplexer:
             multiplexer = bits_of(signal)
             continue
         for page in signal.multiplexer_ids or (None,):
-            made = _Signal(database, copy, signal, binder, settings, protection).made(page)
+            made = _Signal(database, sent, signal, binder, settings, protection).made(page)
             signals.append(made)
     return ExpectedMessage(
-        name=copy.name,
-        can_id=copy.frame_id,
+        name=sent.name,
+        can_id=sent.can_id,
         extended=message.is_extended_frame,
         length=message.length,
         pages=tuple(sorted(pages)) or (None,),
@@ -176,27 +174,27 @@ def _message(
 
 def _protection(
     database: "Database",
-    copy: Copy,
+    sent: SentMessage,
     binder: Binder,
     settings: DbcConfig,
 ) -> tuple[str, tuple[int, ...]] | None:
     """Return E2E profile and data ids of a message. None without a CRC."""
-    if not _has_crc(database, copy, binder):
+    if not _has_crc(database, sent, binder):
         return None
-    profile, _ = stated_profile(settings, database, copy)
+    profile, _ = stated_profile(settings, database, sent.for_binder)
     if profile is None:
-        return "1A", (copy.frame_id & 0xFFFF,)
-    return profile.name, stated_data_ids(settings, database, copy, profile)
+        return "1A", (sent.can_id & 0xFFFF,)
+    return profile.name, stated_data_ids(settings, database, sent.for_binder, profile)
 
 
-def _has_crc(database: "Database", copy: Copy, binder: Binder) -> bool:
-    for signal in copy.message.signals:
-        bound = binder.bound(copy, signal.name)
+def _has_crc(database: "Database", sent: SentMessage, binder: Binder) -> bool:
+    for signal in sent.message.signals:
+        bound = binder.bound(sent.for_binder, signal.name)
         name = signal.name if bound is None else bound
         if not isinstance(name, str):
             continue
         stated = role_of(signal, database) if bound is None else None
-        if stated is None and binder.by_name(name, copy.esc) is not None:
+        if stated is None and binder.by_name(name, sent.esc) is not None:
             continue
         if (stated or protection(name)) is Role.CRC and not signal.is_multiplexer:
             return True
@@ -228,14 +226,14 @@ class _Signal:
     def __init__(
         self,
         database: "Database",
-        copy: Copy,
+        sent: SentMessage,
         signal: "Signal",
         binder: Binder,
         settings: DbcConfig,
         protection: tuple[str, tuple[int, ...]] | None,
     ) -> None:
         self.database = database
-        self.copy = copy
+        self.sent = sent
         self.signal = signal
         self.binder = binder
         self.settings = settings
@@ -250,18 +248,18 @@ class _Signal:
 
     def made(self, page: int | None) -> ExpectedSignal:
         """Return the specification on a page."""
-        name = self.copy.prefix + self.signal.name
+        name = self.sent.prefix + self.signal.name
         bits = bits_of(self.signal)
         source = ""
         rule: Expected | None = None
         reason = ""
-        bound = self.binder.bound(self.copy, self.signal.name)
+        bound = self.binder.bound(self.sent.for_binder, self.signal.name)
         if isinstance(bound, (int, float)):
             rule = self._constant((_exact(bound) - self._offset) / self._factor)
         else:
             role = role_of(self.signal, self.database) if bound is None else None
             known_name = bound or self.signal.name
-            found = None if role else self.binder.by_name(known_name, self.copy.esc)
+            found = None if role else self.binder.by_name(known_name, self.sent.esc)
             if found is not None:
                 value, esc = found
                 source = value.name

@@ -77,8 +77,8 @@ class Verdict:
 def compare(expected: Expected, planned: Planned, settings: Settings) -> Verdict:
     """Prove that a plan sends the bits that its DBC defines, or find a counter-example.
 
-    ``settings`` are tried first for a counter-example. The rule has a quantity, and no floats. No
-    product of the plan leaves 64 bits, which ``products`` shows.
+    ``settings`` are tried first for a counter-example. The rule has a quantity, and no floats. Both
+    are about the same ESC. No product of the plan leaves 64 bits, which ``products`` shows.
     """
     if planned.scale is not None and planned.scale.div <= 0:
         return Verdict(reason="the plan divides by a number that is not positive")
@@ -191,16 +191,15 @@ class _World:
         """Return the steps that the DBC's value has, and the steps that the plan reads."""
         quantity = self.expected.quantity
         assert quantity is not None
-        same_esc = self.planned.esc == self.expected.esc
-        if same_esc and self.planned.read == quantity.read:
+        if self.planned.read == quantity.read:
             x = z3.Int("x")
             self.facts += [quantity.low <= x, x <= quantity.high]
             return x, x
-        x = self._read(quantity.read, "x", quantity.low, quantity.high, 0)
-        other = self._read(self.planned.read, "other", 0, _ANY, 0 if same_esc else 1)
+        x = self._read(quantity.read, "x", quantity.low, quantity.high)
+        other = self._read(self.planned.read, "other", 0, _ANY)
         return x, other
 
-    def _read(self, read: Read, name: str, low: int, high: int, esc: int) -> Any:
+    def _read(self, read: Read, name: str, low: int, high: int) -> Any:
         """Return the steps of a source, made of the bytes of a frame if it is a field."""
         mask = read.mask
         if not read.wire or mask & (mask + 1):
@@ -211,9 +210,8 @@ class _World:
         size = (high - low).bit_length() // _BYTE
         term: Any = 0
         for place in range(size):
-            term = term + self._byte(f"{esc} {read.source}", read.offset + place) * (
-                1 << _BYTE * place
-            )
+            byte = self._byte(read.source, read.offset + place)
+            term = term + byte * (1 << _BYTE * place)
         if low < 0:
             term = z3.If(term > high, term - (high - low + 1), term)
         return (term / (1 << read.shift)) % (mask + 1) if mask else term

@@ -75,7 +75,7 @@ class Proof:
         self.findings = Findings()
         self._layout = layout
         self._escs = escs
-        self._expected = [*expected_messages(database, layout.file, escs, settings)]
+        self._expected = [*expected_messages(database, escs, settings)]
         self._tables: Tables | None = None
         try:
             self._tables = Tables(layout, escs, settings.silent_on_loss)
@@ -85,20 +85,25 @@ class Proof:
     def messages(self) -> Iterator[str]:
         """Prove one message after the other. Yields the name of each before it is proven."""
         prover = Prover(self._escs)
-        plans = {plan.name: number for number, plan in enumerate(self._layout.messages)}
+        plans: dict[str, list[int]] = {}
+        for number, plan in enumerate(self._layout.messages):
+            plans.setdefault(plan.name, []).append(number)
         for expected in self._expected:
             yield expected.name
-            number = plans.pop(expected.name, None)
-            if number is None:
-                self.findings.refuted.append(f"{expected.name}: is never sent")
+            numbers = plans.pop(expected.name, [])
+            if not numbers:
+                self.findings.refuted.append(f"{expected.name}: is in the DBC, but is never sent")
                 continue
+            if len(numbers) > 1:
+                self.findings.refuted.append(f"{expected.name}: is sent {len(numbers)} times")
+            number = numbers[0]
             plan = self._layout.messages[number]
             cores = [of_python(plan, self._escs)]
             if self._tables is not None:
                 cores.append(of_c(plan, number, self._tables))
             prover.prove(expected, cores, self.findings)
         for name in plans:
-            self.findings.refuted.append(f"{name}: is sent, but is not in the DBC")
+            self.findings.refuted.append(f"{name}: is sent, but is not a message of the gateway")
 
     def complete(self) -> Findings:
         """Prove all messages, and return the findings."""
@@ -181,6 +186,10 @@ class Prover:
         if planned.planned is None:
             yield "is sent as a counter of frames"
             return
+        if planned.planned.esc != rule.esc:
+            wanted = self._name(rule.esc)
+            yield f"contains a value of {self._name(planned.planned.esc)}, not of {wanted}"
+            return
         overflow = _overflow(signal, planned.planned)
         if overflow is not None:
             yield overflow
@@ -197,11 +206,14 @@ class Prover:
         elif verdict.reason:
             reasons.append(verdict.reason)
 
+    def _name(self, esc: int | None) -> str:
+        return "the gateway" if esc is None else f"ESC {self._escs[esc].name}"
+
     def _verdict(self, rule: Expected, plan: Planned) -> Verdict:
         """Return the verdict about a plan. Copies for other ESCs have the same."""
         esc = self._escs[rule.esc or 0]
         settings = Settings(esc.pole_pairs, esc.gear, esc.cell_count or 1)
-        normal = replace(plan, esc=None if plan.esc == rule.esc else -1)
+        normal = replace(plan, esc=None)
         rule = replace(rule, esc=None)
         key = (repr(rule), repr(normal), settings)
         if key not in self._solved:
@@ -235,7 +247,7 @@ def _shared_codes(signal: ExpectedSignal, rule: Expected) -> Iterator[str]:
 def _frame_problems(expected: ExpectedMessage, plan: PlannedMessage) -> Iterator[str]:
     """Yield the differences in id, length and constant bits."""
     if (plan.can_id, plan.extended) != (expected.can_id, expected.extended):
-        yield f"is sent with id {plan.can_id:X}h, not {expected.can_id:X}h"
+        yield f"is sent with CAN id {_id(plan)}, not {_id(expected)}"
     if plan.length != expected.length:
         yield f"is sent with {plan.length} bytes, not {expected.length}"
     if plan.crc is not None and expected.crc is not None:
@@ -261,6 +273,10 @@ def _frame_problems(expected: ExpectedMessage, plan: PlannedMessage) -> Iterator
         for bit in range(bits.bit_length()):
             if bits >> bit & 1 and bit not in own:
                 yield f"bit {bit % 8} of byte {bit // 8} is always 1, but no constant is there"
+
+
+def _id(message: ExpectedMessage | PlannedMessage) -> str:
+    return f"{message.can_id:08X}h" if message.extended else f"{message.can_id:03X}h"
 
 
 def _wrong_constant(signal: ExpectedSignal, rule: Expected, plan: PlannedMessage) -> Iterator[str]:
