@@ -277,19 +277,37 @@ static void every_field(const struct scene *s)
 
 /* --- values through pack() -------------------------------------------------------------------- */
 
-/* Packs each message that has one of the signals from `first` on, and compares these. */
-static void pack_and_compare(const char *const *names)
+enum { CHOSEN = 3 };
+/* Signals to compare, and their messages. */
+static struct { const struct expected *signal; const kcg_message *message; } chosen[CHOSEN + 1];
+
+static void choose(const char *const *names)
 {
-    for (; *names; names++) {
+    int count = 0;
+    for (; *names; names++, count++) {
         const struct expected *s = expected;
         while (strcmp(s->name, *names))
             s++;
         const kcg_message *m = kcg_tables.message;
         while (m->id != s->id)
             m++;
-        uint64_t bits;
-        pack(core, m, 0, now, 0, &bits);
-        compare(s, bits, expected_raw(s));
+        chosen[count].signal = s;
+        chosen[count].message = m;
+    }
+    chosen[count].signal = NULL;
+}
+
+/* Packs each message that has one of the chosen signals, and compares these. */
+static void pack_and_compare(void)
+{
+    const kcg_message *packed = NULL;
+    uint64_t bits = 0;
+    for (int k = 0; chosen[k].signal; k++) {
+        if (chosen[k].message != packed) {
+            packed = chosen[k].message;
+            pack(core, packed, 0, now, 0, &bits);
+        }
+        compare(chosen[k].signal, bits, expected_raw(chosen[k].signal));
     }
     values++;
 }
@@ -307,13 +325,14 @@ static void accept_live(void)
 static void every_pair(const char *const *names, int field, int64_t first, int64_t last)
 {
     start(&scenes[0]);
+    choose(names);
     send_values(ANY);
     for (value[VOLTAGE] = 0; value[VOLTAGE] < 1 << 16; value[VOLTAGE]++)
         for (value[field] = first; value[field] <= last; value[field]++) {
             if (field == CELL_COUNT)
                 core->esc->cells = (uint8_t)value[field];
             accept_live();
-            pack_and_compare(names);
+            pack_and_compare();
         }
 }
 
@@ -321,10 +340,11 @@ static void every_speed(void)
 {
     static const char *const names[] = {"ElectricalSpeed", "MotorSpeed", "OutputSpeed", NULL};
     start(&scenes[0]);
+    choose(names);
     send_values(ANY);
     for (value[SPEED] = 0; value[SPEED] <= UINT32_MAX; value[SPEED]++) {
         put(core->esc->live, value[SPEED], 4);
-        pack_and_compare(names);
+        pack_and_compare();
     }
 }
 
