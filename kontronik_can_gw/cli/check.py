@@ -13,7 +13,6 @@ from kontronik_can_gw.cli.common import canopen_setup, say, show
 from kontronik_can_gw.cli.recording import events_in_words, in_words, record_folder, ring_size
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.dbc.reader import listed
-from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.signals.plan import Layout
@@ -38,7 +37,7 @@ EPILOG = (
     "kontronik-can-gw describe "
     "shows the objects and PDOs of CANopen nodes. Exit codes: "
     "0 the configuration can be used, perhaps with warnings; "
-    "1 --prove found a counter-example, or z3 is missing; "
+    "1 --prove found a counter-example, or z3 cannot be used; "
     "2 it cannot be used."
 )
 
@@ -47,6 +46,7 @@ def main(args: argparse.Namespace) -> int:
     path = config_file(args.config)
     try:
         loaded = load_configuration(path)
+        findings = _proof(loaded) if args.prove else None
     except UserError as error:
         if not args.json:
             raise
@@ -61,7 +61,6 @@ def main(args: argparse.Namespace) -> int:
     ]
     warnings = [*loaded.layout.warnings, *loaded.warnings, *examples]
     shown = document(path, loaded, warnings)
-    findings = _proof(loaded) if args.prove else None
     if findings is not None:
         shown["proof"] = asdict(findings)
     if args.json:
@@ -87,18 +86,18 @@ def _exit_code(findings: "Findings | None") -> int:
 def _proof(loaded: Loaded) -> "Findings":
     """Prove the DBC of a configuration, with a progress display.
 
-    Raises RunError without z3, and UserError without a DBC.
+    Raises RunError if z3 cannot be used, and UserError without a DBC.
     """
     if loaded.database is None:
         raise UserError(
             f"{loaded.config.file}: dbc.enabled is false: --prove has nothing to prove. "
             "Set it to true, or leave out --prove."
         )
-    try:
-        from kontronik_can_gw.desk.proof.proof import Proof
-    except ImportError:
-        raise missing_library("check --prove", "prove") from None
+    from kontronik_can_gw.desk.proof.solver import require_z3
+
+    require_z3()
     from kontronik_can_gw.cli.desk import watched
+    from kontronik_can_gw.desk.proof.proof import Proof
 
     proof = Proof(loaded.database, loaded.layout, loaded.escs, loaded.config.dbc)
     messages = ([name] for name in proof.messages())

@@ -99,15 +99,81 @@ def test_a_signal_that_the_solver_gives_up_is_listed_by_name(
     assert "  not proven: Motor.MotorSpeed: the solver gave up: timeout\n" in done.out
 
 
+@pytest.fixture
+def not_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the next command import z3 and the modules of the proof again."""
+    for name in [*sys.modules]:
+        if "desk.proof" in name or name.partition(".")[0] == "z3":
+            monkeypatch.delitem(sys.modules, name)
+
+
+def install_other_z3(folder: Path, monkeypatch: pytest.MonkeyPatch, source: str) -> None:
+    """Put a package with the name z3 before the installed one."""
+    (folder / "other/z3").mkdir(parents=True)
+    written(folder / "other/z3/__init__.py", source)
+    monkeypatch.syspath_prepend(str(folder / "other"))
+
+
+@pytest.mark.usefixtures("not_imported")
 def test_without_z3_the_command_says_how_to_install_it(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in [name for name in sys.modules if "desk.proof" in name]:
-        monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "z3", None)
     line = refused(1, "check", "--prove", path)
     assert line.startswith("check --prove needs z3-solver>=")
     assert "Install it: " in line
+
+
+@pytest.mark.usefixtures("not_imported")
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("raise OSError('libz3.so: cannot open')", "libz3.so: cannot open"),
+        ("print('Advice')\nraise Exception('libz3.so\\nnot found.')", "libz3.so not found"),
+        ("raise AttributeError", "AttributeError"),
+        ("import nothing_of_this_name", "No module named 'nothing_of_this_name'"),
+    ],
+)
+def test_a_broken_z3_is_reported_with_the_reason(
+    path: Path, monkeypatch: pytest.MonkeyPatch, source: str, reason: str
+) -> None:
+    install_other_z3(path.parent, monkeypatch, source)
+    line = refused(1, "check", "--prove", path)
+    assert line.startswith("check --prove needs z3-solver>=")
+    assert ", but z3 is broken: " in line
+    assert f"{reason}. Install it again: " in line
+
+
+@pytest.mark.usefixtures("not_imported")
+def test_another_package_with_the_name_z3_is_reported(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install_other_z3(path.parent, monkeypatch, "def backup() -> None: ...")
+    line = refused(1, "check", "--prove", path)
+    assert "the installed z3 is another library" in line
+    assert "-m pip uninstall z3. Then: " in line
+    assert "-m pip install --force-reinstall 'z3-solver>=" in line
+
+
+@pytest.mark.usefixtures("not_imported")
+def test_an_import_error_of_the_proof_itself_does_not_blame_z3(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "kontronik_can_gw.desk.proof.formulas", None)
+    with pytest.raises(ImportError, match="formulas"):
+        run("check", "--prove", path)
+
+
+@pytest.mark.usefixtures("not_imported")
+def test_json_without_z3_contains_the_line_as_a_mistake(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "z3", None)
+    done = run("check", "--prove", "--json", path)
+    assert done.code == 1
+    assert done.err == ""
+    (line,) = json.loads(done.out)["mistakes"]
+    assert line.startswith("check --prove needs z3-solver>=")
 
 
 def test_a_dbc_that_check_refuses_is_refused_the_same_way(path: Path) -> None:
@@ -119,6 +185,9 @@ def test_without_a_dbc_output_there_is_nothing_to_prove(tmp_path: Path) -> None:
     text = f"{ESC}[dbc]\nenabled = false\n[canopen]\nenabled = true\n"
     line = refused(2, "check", "--prove", written(tmp_path / "gateway.toml", text))
     assert "--prove has nothing to prove" in line
+    done = run("check", "--prove", "--json", tmp_path / "gateway.toml")
+    assert done.code == 2
+    assert json.loads(done.out)["mistakes"] == [line]
 
 
 def test_each_value_is_in_the_sheet_of_the_proof() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,13 @@ from put_in_faults import Fault
 from kontronik_can_gw.desk.proof.proof import IS_CRC, IS_FLOAT
 
 PROJECT = Path(__file__).resolve().parents[2]
-EXAMPLES = sorted((PROJECT / "examples").glob("*/gateway.toml"))
+EXAMPLES = {
+    "four-escs-canopen/bus.dbc": 402,
+    "j1939/j1939.dbc": 9,
+    "one-esc/bus.dbc": 108,
+    "vehicle-dbc/vehicle.dbc": 11,
+}
+"""The DBC on the bus of each example, and the number of its signals that the gateway sends."""
 ONE_ESC = '[[esc]]\nport = "/dev/ttyUSB0"\npole_pairs = 7\n'
 EVERY_RULE = f"""
 [can]
@@ -59,24 +66,58 @@ def proof_of(path: Path) -> dict[str, Any]:
     return found
 
 
-def test_the_shipped_dbc_is_proven_completely(tmp_path: Path) -> None:
+def signals_in(dbc: Path) -> list[str]:
+    """Return "Message.Signal" for each signal of a gateway's node in the text of a DBC."""
+    found = []
+    message = transmitter = ""
+    for line in dbc.read_text(encoding="cp1252").splitlines():
+        if start := re.match(r"BO_ \d+ (\w+): \d+ (\w+)", line):
+            message, transmitter = start.groups()
+        elif (signal := re.match(r" SG_ (\w+) ", line)) and transmitter.endswith("Gateway"):
+            found.append(f"{message}.{signal[1]}")
+    return found
+
+
+def test_each_signal_of_the_shipped_dbc_is_proven(tmp_path: Path) -> None:
     found = proof_of(written(tmp_path / "gateway.toml", ONE_ESC))
     assert found["refuted"] == []
     assert found["unproven"] == []
-    assert len(found["proven"]) > 100
+    assert sorted(found["proven"]) == sorted(signals_in(PROJECT / "dbc/kontronik_esc.dbc"))
+    assert len(found["proven"]) == 108
     assert found["only_python"] == ""
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.parent.name)
-def test_the_dbc_of_each_example_is_proven_completely(path: Path) -> None:
-    found = proof_of(path)
+@pytest.mark.parametrize(("dbc", "signals"), EXAMPLES.items())
+def test_each_signal_of_an_example_is_proven(dbc: str, signals: int) -> None:
+    file = PROJECT / "examples" / dbc
+    found = proof_of(file.with_name("gateway.toml"))
     assert found["refuted"] == []
     assert found["unproven"] == []
-    assert found["proven"]
+    assert sorted(found["proven"]) == sorted(signals_in(file))
+    assert len(found["proven"]) == signals
 
 
-def test_there_are_four_examples() -> None:
-    assert len(EXAMPLES) == 4
+def test_the_list_of_examples_is_complete() -> None:
+    configurations = (PROJECT / "examples").glob("*/gateway.toml")
+    assert {file.parent.name for file in configurations} == {Path(dbc).parts[0] for dbc in EXAMPLES}
+
+
+def test_each_signal_of_a_dbc_is_named_as_proven_or_not_proven(tmp_path: Path) -> None:
+    """One signal is a float and one a CRC. The lines of ``check`` name each signal once."""
+    signals = [
+        Sig("M_CRC", 0, 8),
+        Sig("M_BZ", 8, 4),
+        Sig("BatteryVoltage", 16, 16, unit="V", factor="0.01"),
+        Sig("Throttle", 32, 32, is_float=True, unit="%"),
+    ]
+    dbc = written(tmp_path / "mixed.dbc", dbc_text([Msg("M", 0x123, 8, signals)]))
+    keys = f'[dbc]\nfile = "{dbc}"\nnode = "Gateway"\n[dbc.e2e]\nM = "1A"\n'
+    found = proof_of(written(tmp_path / "gateway.toml", ONE_ESC + keys))
+    assert found["refuted"] == []
+    assert found["unproven"] == [f"M.M_CRC: {IS_CRC}", f"M.Throttle: {IS_FLOAT}"]
+    named = [*found["proven"], *(line.partition(": ")[0] for line in found["unproven"])]
+    assert sorted(named) == sorted(signals_in(dbc))
+    assert len(named) == len(signals)
 
 
 def test_a_dbc_with_each_kind_of_signal_is_proven_completely(tmp_path: Path) -> None:
