@@ -12,6 +12,7 @@ from command_line import refused, run, written
 from kontronik_can_gw.desk.proof import planned
 from kontronik_can_gw.desk.proof.quantities import QUANTITIES, Divisor
 from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.signals.plan import Layout
 
 pytest.importorskip("z3")
 
@@ -85,6 +86,40 @@ def test_a_wrong_plan_is_refuted_in_the_words_of_the_user(
     )
     assert lines[1].startswith("  REFUTED   Motor.MotorSpeed: motor speed ")
     assert " rpm with 7 pole pairs is sent as " in lines[1]
+
+
+def test_no_signal_of_a_message_with_a_wrong_id_is_proven(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from kontronik_can_gw.desk.proof import proof  # needs z3
+
+    right = planned.of_python
+
+    def wrong(*arguments: Any) -> planned.PlannedMessage:
+        return replace(right(*arguments), can_id=257)
+
+    monkeypatch.setattr(proof, "of_python", wrong)
+    done = run("check", "--prove", path)
+    assert done.code == 1
+    assert "  proof     0 of 3 signals proven for all values and settings\n" in done.out
+    assert "  REFUTED   Motor: is sent with CAN id 101h, not 100h\n" in done.out
+
+
+def test_no_signal_of_a_message_that_is_never_sent_is_proven(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from kontronik_can_gw.desk.proof import proof  # needs z3
+
+    right = proof.Proof.__init__
+
+    def wrong(self: Any, database: Any, layout: Layout, *others: Any) -> None:
+        right(self, database, replace(layout, messages=()), *others)
+
+    monkeypatch.setattr(proof.Proof, "__init__", wrong)
+    done = run("check", "--prove", path)
+    assert done.code == 1
+    assert "  proof     0 of 3 signals proven for all values and settings\n" in done.out
+    assert "  REFUTED   Motor: is in the DBC, but is never sent\n" in done.out
 
 
 def test_a_signal_that_the_solver_gives_up_is_listed_by_name(

@@ -52,11 +52,19 @@ class Findings:
     refuted: list[str] = field(default_factory=list)
     """Counter-examples."""
     refuted_signals: list[str] = field(default_factory=list)
-    """Signals with a counter-example."""
+    """Signals with a counter-example, and all signals of a message that is wrong or missing."""
     without_code: list[str] = field(default_factory=list)
     """Proven signals whose code for "not available" is also a value."""
     only_python: str = ""
     """The reason why only the core in Python can send the layout, or ""."""
+
+    def add(self, other: "Findings") -> None:
+        """Add the signals of other findings."""
+        self.proven += other.proven
+        self.unproven += other.unproven
+        self.refuted += other.refuted
+        self.refuted_signals += other.refuted_signals
+        self.without_code += other.without_code
 
 
 class Proof:
@@ -93,6 +101,7 @@ class Proof:
             numbers = plans.pop(expected.name, [])
             if not numbers:
                 self.findings.refuted.append(f"{expected.name}: is in the DBC, but is never sent")
+                self.findings.refuted_signals += _names(expected)
                 continue
             if len(numbers) > 1:
                 self.findings.refuted.append(f"{expected.name}: is sent {len(numbers)} times")
@@ -129,6 +138,15 @@ class Prover:
             for problem in _frame_problems(expected, plan)
         ]
         findings.refuted += dict.fromkeys(wrong)
+        own = Findings()
+        self._prove_signals(expected, plans, own)
+        if wrong:
+            own = Findings(refuted=own.refuted, refuted_signals=_names(expected))
+        findings.add(own)
+
+    def _prove_signals(
+        self, expected: ExpectedMessage, plans: Sequence[PlannedMessage], findings: Findings
+    ) -> None:
         by_name: dict[str, list[ExpectedSignal]] = {}
         for signal in expected.signals:
             by_name.setdefault(signal.name, []).append(signal)
@@ -219,6 +237,11 @@ class Prover:
         if key not in self._solved:
             self._solved[key] = compare(rule, normal, settings)
         return self._solved[key]
+
+
+def _names(message: ExpectedMessage) -> list[str]:
+    """Return the names of a message's signals as they are in the findings."""
+    return list(dict.fromkeys(f"{message.name}.{signal.name}" for signal in message.signals))
 
 
 def _is_on(planned: PlannedSignal, signal: ExpectedSignal) -> bool:
