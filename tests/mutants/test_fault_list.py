@@ -13,7 +13,10 @@ from put_in_faults import PROJECT, Fault, faults
 def test_each_fault_of_the_list_can_be_put_in(fault: Fault) -> None:
     file, changed = fault.put_in()
     assert changed != file.read_text()
-    assert all((PROJECT / tests).exists() for tests in fault.seen_by)
+    for tests in fault.seen_by:
+        path, _, name = tests.partition("::")
+        assert (PROJECT / path).exists()
+        assert not name or f"def {name}(" in (PROJECT / path).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("code", "is_decided"), [(0, True), (1, False), ("no end", False)])

@@ -3,8 +3,9 @@
 Eva follows all runs of any_calls.c at once: any bytes, times, settings and order of calls, within
 the preconditions of core.h, with the tables of the shipped DBC. eva_hints.toml lists annotations
 that make its results more exact. An alarm is a place where Eva cannot exclude undefined behaviour.
-alarms.toml lists each alarm with the reason why it is false. A new alarm fails the test. An alarm
-in the list that Eva no longer reports fails it, too.
+alarms.toml lists each alarm with the reason why it is false. A new alarm fails the first test. Only
+this test refutes the faults that put_in_faults.py puts in. The second test keeps the list short: an
+alarm that Eva no longer reports must be removed from it.
 
 Eva needs about 200 s of CPU time. A step of `make release`:
 python -m pytest -s -o faulthandler_timeout=900 tests/proofs/long_eva.py
@@ -18,6 +19,7 @@ import subprocess
 import tomllib
 from pathlib import Path
 
+import pytest
 from built import there
 from every_value import export_shipped
 
@@ -78,11 +80,30 @@ def _without_numbers(text: str) -> str:
     return re.sub(r"\b(tmp|now|frames)_\d+\b", r"\1", text)
 
 
-def test_eva_finds_no_undefined_behaviour_except_the_listed_alarms(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """The alarms of one run of Eva, for all tests."""
     there("frama-c")
-    groups = tomllib.loads(ALARMS.read_text())["group"]
+    return find_alarms(tmp_path_factory.mktemp("eva"))
+
+
+@pytest.fixture(scope="module")
+def listed() -> set[str]:
+    """The alarms of alarms.toml."""
+    groups = tomllib.loads(ALARMS.read_text(encoding="utf-8"))["group"]
     assert all(len(group["why"]) > 20 for group in groups)
-    listed = {alarm for group in groups for alarm in group["alarms"]}
-    found = find_alarms(tmp_path)
-    print(f"{len(found)} alarms, each of them listed with a reason")
-    assert found == listed, f"new: {sorted(found - listed)}; gone: {sorted(listed - found)}"
+    return {alarm for group in groups for alarm in group["alarms"]}
+
+
+def test_eva_finds_no_undefined_behaviour_except_the_listed_alarms(
+    found: set[str],
+    listed: set[str],
+) -> None:
+    print(f"{len(found)} alarms, {len(found & listed)} of them listed with a reason")
+    new = sorted(found - listed)
+    assert not new
+
+
+def test_eva_still_reports_each_listed_alarm(found: set[str], listed: set[str]) -> None:
+    gone = sorted(listed - found)
+    assert not gone
