@@ -5,8 +5,8 @@
 WORDS select the faults whose description contains one of them. A fault can be in a Python file, in
 a C source or in a systemd unit of kontronik_can_gw. Exits with 0 if the tests detected every fault,
 else with 1 and one line for each fault that they missed or that no longer fits the code. The tests
-of a fault must pass without it: otherwise their failure says nothing. If `seen_by` names one test of
-a file ("file.py::test"), this test itself must fail: an error of a fixture or of a tool does not
+of a fault must pass without it: otherwise their failure says nothing. If `seen_by` names one test
+of a file ("file.py::test"), this test itself must fail: an error of a fixture or of a tool does not
 count. If the tests are slow, a run without an end does not count, either.
 """
 
