@@ -29,6 +29,8 @@ INTERFACE = "plug0"
 RUNS = 2
 STORES = 7
 """Number of sets that each run stores."""
+LEAST_BLOCKS = 5
+"""Smallest number of blocks of a run's capture."""
 _MARK_S = 0.05
 _LOG_BYTES = 400 << 20
 _START_S = 30
@@ -139,6 +141,10 @@ def record(system: FileSystem, disk: LoopDevice, seed: int) -> Recorded:
     log = Log(device.entries(), system.unit)
     device.close()
     loop.close()
+    # without captures and stored parameters each state would be good
+    assert len(captures) == RUNS, sorted(captures)
+    assert all(len(each.blocks) >= LEAST_BLOCKS for each in captures.values())
+    assert log.stored(len(log.entries)) == RUNS * STORES
     return Recorded(log, captures)
 
 
