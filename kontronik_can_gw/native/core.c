@@ -488,7 +488,7 @@ static void integrate(kcg_esc *e, int64_t dt)
         e->energy_rest = rest % SECOND;
     }
     if (e->turns)
-        e->run_time += dt;
+        e->run_time += (uint64_t)dt;
 }
 
 /* Takes a frame. Its last byte arrived at `when`, and at `bound` at the earliest. */
@@ -591,7 +591,7 @@ static inline int steps(const kcg *g, const kcg_signal *s, const kcg_esc *e, int
         return e->has_live;
     case KCG_OF_COUNT: *x = (int64_t)kcg_count(e, s->place); return 1;
     case KCG_OF_ENERGY: *x = (int64_t)e->energy; return 1;
-    case KCG_OF_RUN_TIME: *x = e->run_time; return 1;
+    case KCG_OF_RUN_TIME: *x = (int64_t)e->run_time; return 1;
     case KCG_OF_AGE:
         *x = now > e->live_ns ? (now - e->live_ns) / 1000000 : 0;
         return e->has_time;

@@ -302,7 +302,7 @@ typedef struct {
     uint32_t base, blame_until;
     uint64_t energy;            /* In mW s. */
     int64_t energy_rest;        /* The rest in mW ns. */
-    int64_t run_time;
+    uint64_t run_time;
     /* Arrival of the newest live frame: as ages count it, and the earliest possible one. */
     int64_t live_ns, live_bound;
     int64_t info_bound, last_info_ns;
