@@ -106,7 +106,7 @@ static void any_call(kcg *g)
     default:
         g->gateway[Frama_C_interval(KCG_GATEWAY_STATE, KCG_ID_CONFLICTS)] =
             Frama_C_long_long_interval(0, INT64_C(1) << 48);
-        g->mask = Frama_C_unsigned_int_interval(0, 31);
+        g->mask = Frama_C_unsigned_int_interval(0, 63);
     }
     while (kcg_next_event(g) != -1) {}
     kcg_next_deadline(g);
