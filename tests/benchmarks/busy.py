@@ -153,15 +153,16 @@ def watch(cpu: int) -> None:
 def raise_workers() -> None:
     """Give kernel workers real-time priority until standard input ends."""
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_WATCHER_PRIORITY))
-    raised: dict[int, tuple[int, os.sched_param]] = {}
+    raised: set[int] = set()
     while not _has_ended(_NEW_WORKERS_S):
-        for pid in _normal_workers():
+        for pid in _workers():
             with suppress(ProcessLookupError):  # it has ended
-                raised[pid] = (os.sched_getscheduler(pid), os.sched_getparam(pid))
-                os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(_WORKER_PRIORITY))
-    for pid in _workers() & raised.keys():
+                if os.sched_getscheduler(pid) == os.SCHED_OTHER:
+                    os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(_WORKER_PRIORITY))
+                    raised.add(pid)
+    for pid in _workers() & raised:
         with suppress(ProcessLookupError):
-            os.sched_setscheduler(pid, *raised[pid])
+            os.sched_setscheduler(pid, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _workers() -> set[int]:
@@ -171,15 +172,6 @@ def _workers() -> set[int]:
         with suppress(OSError):  # it has ended
             if file.read_text().startswith(_WORKERS):
                 found.add(int(file.parent.name))
-    return found
-
-
-def _normal_workers() -> list[int]:
-    found = []
-    for pid in _workers():
-        with suppress(ProcessLookupError):
-            if os.sched_getscheduler(pid) == os.SCHED_OTHER:
-                found.append(pid)
     return found
 
 
