@@ -19,7 +19,7 @@ from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import UNCONFIGURED
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.desk.proof.proof import Findings
+    from dbc_proof.proof import Findings
 
 _EXAMPLE_PORT = "_EXAMPLE-"
 """Part of the port's name in the configuration that ``init`` writes."""
@@ -93,11 +93,11 @@ def _proof(loaded: Loaded) -> "Findings":
             f"{loaded.config.file}: dbc.enabled is false: --prove has nothing to prove. "
             "Set it to true, or leave out --prove."
         )
-    from kontronik_can_gw.desk.proof.solver import require_z3
+    from dbc_proof.solver import require_z3
 
     require_z3()
     from kontronik_can_gw.cli.desk import watched
-    from kontronik_can_gw.desk.proof.proof import Proof
+    from dbc_proof.proof import Proof
 
     proof = Proof(loaded.database, loaded.layout, loaded.escs, loaded.config.dbc)
     messages = ([name] for name in proof.messages())

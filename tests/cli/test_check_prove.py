@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from command_line import refused, run, written
 
-from kontronik_can_gw.desk.proof import planned
-from kontronik_can_gw.desk.proof.quantities import QUANTITIES, Divisor
+from dbc_proof import planned
+from dbc_proof.quantities import QUANTITIES, Divisor
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.signals.plan import Layout
 
@@ -91,7 +91,7 @@ def test_a_wrong_plan_is_refuted_in_the_words_of_the_user(
 def test_no_signal_of_a_message_with_a_wrong_id_is_proven(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from kontronik_can_gw.desk.proof import proof  # needs z3
+    from dbc_proof import proof  # needs z3
 
     right = planned.of_python
 
@@ -108,7 +108,7 @@ def test_no_signal_of_a_message_with_a_wrong_id_is_proven(
 def test_no_signal_of_a_message_that_is_never_sent_is_proven(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from kontronik_can_gw.desk.proof import proof  # needs z3
+    from dbc_proof import proof  # needs z3
 
     right = proof.Proof.__init__
 
@@ -194,7 +194,7 @@ def test_another_package_with_the_name_z3_is_reported(
 def test_an_import_error_of_the_proof_itself_does_not_blame_z3(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "kontronik_can_gw.desk.proof.formulas", None)
+    monkeypatch.setitem(sys.modules, "dbc_proof.formulas", None)
     with pytest.raises(ImportError, match="formulas"):
         run("check", "--prove", path)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from test_corpus import ESCS, FILES, accepted
 
-from kontronik_can_gw.desk.proof.proof import IS_CRC, IS_FLOAT, Proof
+from dbc_proof.proof import IS_CRC, IS_FLOAT, Proof
 from kontronik_can_gw.signals.plan import Role
 
 

@@ -17,7 +17,7 @@ from command_line import run, written
 from packer_oracle import Msg, Sig, dbc_text
 from put_in_faults import Fault
 
-from kontronik_can_gw.desk.proof.proof import IS_CRC, IS_FLOAT
+from dbc_proof.proof import IS_CRC, IS_FLOAT
 
 PROJECT = Path(__file__).resolve().parents[2]
 EXAMPLES = {

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from kontronik_can_gw.desk.proof.end_to_end import CrcRule, rule_of_c, rule_of_python
-from kontronik_can_gw.desk.proof.quantities import (
+from dbc_proof.end_to_end import CrcRule, rule_of_c, rule_of_python
+from dbc_proof.quantities import (
     HEADER,
     PRODUCT,
     Divisor,

@@ -13,9 +13,9 @@ from typing import Any
 
 import z3  # type: ignore[import-untyped]
 
-from kontronik_can_gw.desk.proof.expected import Expected, Shape
-from kontronik_can_gw.desk.proof.planned import INT64_END, LARGEST, Planned
-from kontronik_can_gw.desk.proof.quantities import WIRE_RANGES, Divisor, Presence, Read
+from dbc_proof.expected import Expected, Shape
+from dbc_proof.planned import INT64_END, LARGEST, Planned
+from dbc_proof.quantities import WIRE_RANGES, Divisor, Presence, Read
 
 TIMEOUT_MS = 10_000
 """Time for one formula. z3 needs some milliseconds for almost all of them."""

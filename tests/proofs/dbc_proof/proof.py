@@ -6,17 +6,17 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.desk.proof import words
-from kontronik_can_gw.desk.proof.end_to_end import CrcRule
-from kontronik_can_gw.desk.proof.expected import (
+from dbc_proof import words
+from dbc_proof.end_to_end import CrcRule
+from dbc_proof.expected import (
     Expected,
     ExpectedMessage,
     ExpectedSignal,
     Shape,
     expected_messages,
 )
-from kontronik_can_gw.desk.proof.formulas import Settings, Verdict, compare, received
-from kontronik_can_gw.desk.proof.planned import (
+from dbc_proof.formulas import Settings, Verdict, compare, received
+from dbc_proof.planned import (
     INT64_END,
     Planned,
     PlannedMessage,

@@ -19,9 +19,9 @@ from kontronik_can_gw.dbc.e2e_attributes import role_of
 from kontronik_can_gw.dbc.names import Binder, is_data_id, protection
 from kontronik_can_gw.dbc.protection import stated_data_ids, stated_profile
 from kontronik_can_gw.dbc.reader import attribute
-from kontronik_can_gw.desk.proof.end_to_end import COUNTERS, CrcRule, expected_rule
-from kontronik_can_gw.desk.proof.messages import SentMessage, sent_messages
-from kontronik_can_gw.desk.proof.quantities import QUANTITIES, Quantity, size
+from dbc_proof.end_to_end import COUNTERS, CrcRule, expected_rule
+from dbc_proof.messages import SentMessage, sent_messages
+from dbc_proof.quantities import QUANTITIES, Quantity, size
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.signals import units
