@@ -10,6 +10,7 @@ help:
 	@echo 'make test-all  the slower tests: faults, systemd, browser, MQTT broker, CANopen masters'
 	@echo '               of other projects   (ARGS="--only faults|tools|masters|prove|cuts")'
 	@echo 'make prove     the proofs of docs/proof.md that end within 5 min; a part of make test-all'
+	@echo '               (your DBC: ARGS="-c /PATH/gateway.toml", see docs/your-own-dbc.md)'
 	@echo 'make release   tests that take hours, on a quiet machine: faults on emulated hardware,'
 	@echo '               random faults, a recorded hour'
 	@echo '               (ARGS="--only qemu|outages|soak|hours|hour|put-in|machines|fuzz|proofs|years")'
@@ -48,7 +49,10 @@ test-all:
 
 prove:
 	@tests/bootstrap.sh prove
-	@.venv/bin/python tests/run.py prove $(ARGS)
+	@case " $(ARGS) " in \
+	*" -c "*) PYTHONPATH=tests .venv/bin/python tests/proofs/prove_dbc.py $(ARGS);; \
+	*) .venv/bin/python tests/run.py prove $(ARGS);; \
+	esac
 
 release:
 	@tests/bootstrap.sh release

@@ -3,9 +3,8 @@
 import argparse
 import tomllib
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kontronik_can_gw.assembly.assemble import Loaded, load_configuration
 from kontronik_can_gw.cli.arguments import CONFIG, JSON, config_file, option
@@ -18,18 +17,10 @@ from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import UNCONFIGURED
 
-if TYPE_CHECKING:
-    from dbc_proof.proof import Findings
-
 _EXAMPLE_PORT = "_EXAMPLE-"
 """Part of the port's name in the configuration that ``init`` writes."""
 OPTIONS = (
     CONFIG,
-    option(
-        "--prove",
-        "also prove with z3, for all values, devices and settings, that the frames contain what "
-        "the DBC defines",
-    ),
     (option("-v --verbose", "also print all keys in effect, messages and signals"), JSON),
 )
 EPILOG = (
@@ -37,7 +28,6 @@ EPILOG = (
     "kontronik-can-gw describe "
     "shows the objects and PDOs of CANopen nodes. Exit codes: "
     "0 the configuration can be used, perhaps with warnings; "
-    "1 --prove found a counter-example, or z3 cannot be used; "
     "2 it cannot be used."
 )
 
@@ -46,7 +36,6 @@ def main(args: argparse.Namespace) -> int:
     path = config_file(args.config)
     try:
         loaded = load_configuration(path)
-        findings = _proof(loaded) if args.prove else None
     except UserError as error:
         if not args.json:
             raise
@@ -61,70 +50,17 @@ def main(args: argparse.Namespace) -> int:
     ]
     warnings = [*loaded.layout.warnings, *loaded.warnings, *examples]
     shown = document(path, loaded, warnings)
-    if findings is not None:
-        shown["proof"] = asdict(findings)
     if args.json:
         print(printable_json(shown, indent=2))
-        return _exit_code(findings)
+        return 0
     for warning in warnings:
         say(f"warning: {warning}")
     for line in summary(shown, loaded):
         show(line)
-    if findings is not None:
-        for line in proof_lines(findings, args.verbose):
-            show(line)
     if args.verbose:
         for line in details(loaded):
             show(line)
-    return _exit_code(findings)
-
-
-def _exit_code(findings: "Findings | None") -> int:
-    return int(findings is not None and bool(findings.refuted))
-
-
-def _proof(loaded: Loaded) -> "Findings":
-    """Prove the DBC of a configuration, with a progress display.
-
-    Raises RunError if z3 cannot be used, and UserError without a DBC.
-    """
-    if loaded.database is None:
-        raise UserError(
-            f"{loaded.config.file}: dbc.enabled is false: --prove has nothing to prove. "
-            "Set it to true, or leave out --prove."
-        )
-    from dbc_proof.solver import require_z3
-
-    require_z3()
-    from kontronik_can_gw.cli.desk import watched
-    from dbc_proof.proof import Proof
-
-    proof = Proof(loaded.database, loaded.layout, loaded.escs, loaded.config.dbc)
-    messages = ([name] for name in proof.messages())
-    for _ in watched(messages, f"messages of {loaded.layout.file}", data_on_screen=False):
-        pass
-    return proof.findings
-
-
-def proof_lines(findings: "Findings", verbose: bool) -> Iterator[str]:
-    """Yield the results of a proof. ``verbose``: with the names of all signals."""
-    proven = len(findings.proven)
-    total = proven + len(findings.unproven) + len(findings.refuted_signals)
-    core = "both cores"
-    if findings.only_python:
-        core = f"the core in Python, because the core in C cannot run: {findings.only_python}"
-    yield f"  proof     {proven} of {_counted(total, 'signal')} proven for all values and settings"
-    yield f"            {core}"
-    for text in findings.refuted:
-        yield f"  REFUTED   {text}"
-    for text in findings.unproven:
-        yield f"  not proven: {text}"
-    if findings.without_code:
-        names = listed(findings.without_code, len(findings.without_code) if verbose else 3)
-        yield f'  no code for "not available", which is sent as a value: {names}'
-    if verbose:
-        for name in findings.proven:
-            yield f"  proven    {name}"
+    return 0
 
 
 def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:

@@ -14,7 +14,6 @@ EXTRAS = {
     "parquet": "pyarrow>=15",
     "mqtt": "paho-mqtt>=2",
     "metrics": "prometheus-client>=0.20",
-    "prove": "z3-solver>=4.12",
 }
 """The library of each extra in pyproject.toml."""
 
@@ -27,22 +26,6 @@ def missing_library(purpose: str, extra: str) -> RunError:
     else:
         advice = f"Install it: {install_command(requirement)}"
     return RunError(f"{purpose} needs {requirement}. {advice}")
-
-
-def unusable_library(purpose: str, extra: str, reason: str, remove: str = "") -> RunError:
-    """The error for a library that is installed, but cannot be used.
-
-    ``remove`` is the package that must be removed before, because it is another one.
-    """
-    requirement = EXTRAS[extra]
-    again = _command("--force-reinstall", requirement)
-    if _is_system_python():
-        advice = _clone_advice(extra)
-    elif remove:
-        advice = f"Remove it: {_uninstall_command(remove)}. Then: {again}"
-    else:
-        advice = f"Install it again: {again}"
-    return RunError(f"{purpose} needs {requirement}, but {reason}. {advice}")
 
 
 def _clone_advice(extra: str) -> str:
@@ -62,12 +45,6 @@ def _command(option: str, requirement: str) -> str:
     if _is_in_pipx():
         return f"pipx inject --force kontronik-can-gw '{requirement}'"
     return f"{sys.executable} -m pip install {option} '{requirement}'"
-
-
-def _uninstall_command(package: str) -> str:
-    if _is_in_pipx():
-        return f"pipx runpip kontronik-can-gw uninstall {package}"
-    return f"{sys.executable} -m pip uninstall {package}"
 
 
 def _is_in_pipx() -> bool:

@@ -15,7 +15,6 @@ from kontronik_can_gw.desk.libraries import (
     EXTRAS,
     install_command,
     missing_library,
-    unusable_library,
 )
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -51,35 +50,6 @@ def test_in_a_virtual_environment_the_advice_installs_the_library_alone(
     assert said == f"MF4 needs asammdf>=8. Install it: {command}"
 
 
-@pytest.mark.parametrize(
-    ("prefix", "remove", "install"),
-    [
-        (
-            "/home/me/clone/.venv",
-            "/x/bin/python -m pip uninstall z3",
-            "/x/bin/python -m pip install --force-reinstall 'z3-solver>=4.12'",
-        ),
-        (
-            "/home/me/.local/share/pipx/venvs/kontronik-can-gw",
-            "pipx runpip kontronik-can-gw uninstall z3",
-            "pipx inject --force kontronik-can-gw 'z3-solver>=4.12'",
-        ),
-    ],
-)
-def test_a_library_that_cannot_be_used_is_installed_again(
-    prefix: str,
-    remove: str,
-    install: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(sys, "prefix", prefix)
-    monkeypatch.setattr(sys, "executable", "/x/bin/python")
-    said = str(unusable_library("Proofs", "prove", "it is broken"))
-    assert said == f"Proofs needs z3-solver>=4.12, but it is broken. Install it again: {install}"
-    said = str(unusable_library("Proofs", "prove", "it is another one", remove="z3"))
-    assert said.endswith(f"it is another one. Remove it: {remove}. Then: {install}")
-
-
 @pytest.mark.parametrize("is_debian", [True, False])
 def test_in_the_debian_package_the_advice_is_to_install_a_clone(
     is_debian: bool,
@@ -95,8 +65,6 @@ def test_in_the_debian_package_the_advice_is_to_install_a_clone(
     assert said.startswith("Parquet needs pyarrow>=15. ")
     assert ("~/kontronik/bin/pip install '.[parquet]'" in said) == is_debian
     assert (" -m pip install --upgrade 'pyarrow>=15'" in said) != is_debian
-    said = str(unusable_library("Proofs", "prove", "z3 is broken"))
-    assert ("~/kontronik/bin/pip install '.[prove]'" in said) == is_debian
 
 
 def test_no_text_names_an_index_that_lacks_the_package() -> None:

@@ -6,9 +6,9 @@ python -m pytest -s tests/proofs/real_dbcs.py
 from pathlib import Path
 
 import pytest
+from dbc_proof.proof import IS_CRC, IS_FLOAT, Proof
 from test_corpus import ESCS, FILES, accepted
 
-from dbc_proof.proof import IS_CRC, IS_FLOAT, Proof
 from kontronik_can_gw.signals.plan import Role
 
 

@@ -14,14 +14,14 @@ from enum import Enum
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
+from dbc_proof.end_to_end import COUNTERS, CrcRule, expected_rule
+from dbc_proof.messages import SentMessage, sent_messages
+from dbc_proof.quantities import QUANTITIES, Quantity, size
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.e2e_attributes import role_of
 from kontronik_can_gw.dbc.names import Binder, is_data_id, protection
 from kontronik_can_gw.dbc.protection import stated_data_ids, stated_profile
 from kontronik_can_gw.dbc.reader import attribute
-from dbc_proof.end_to_end import COUNTERS, CrcRule, expected_rule
-from dbc_proof.messages import SentMessage, sent_messages
-from dbc_proof.quantities import QUANTITIES, Quantity, size
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.signals import units

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.config.output_keys import DbcConfig
 from dbc_proof import words
 from dbc_proof.end_to_end import CrcRule
 from dbc_proof.expected import (
@@ -25,6 +24,7 @@ from dbc_proof.planned import (
     of_python,
     products,
 )
+from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.native.tables import Tables

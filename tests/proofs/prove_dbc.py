@@ -1,0 +1,92 @@
+"""Proves the DBC of a configuration: ``make prove ARGS='-c gateway.toml'``.
+
+Exit codes: 0 every signal is proven; 1 a signal or message is refuted; 2 the configuration cannot
+be used; 3 nothing is refuted, but not every signal is proven. docs/your-own-dbc.md explains the
+output.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from dbc_proof.proof import Findings, Proof
+
+from kontronik_can_gw import __version__
+from kontronik_can_gw.assembly.assemble import Loaded, load_configuration
+from kontronik_can_gw.dbc.reader import listed
+from kontronik_can_gw.errors import UserError
+
+REFUTED = 1
+NOT_PROVEN = 3
+
+
+def main(words: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(
+        prog="make prove ARGS=",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("-c", required=True, type=Path, metavar="FILE", help="the configuration")
+    parser.add_argument("-v", action="store_true", help="also print the names of proven signals")
+    parser.add_argument("--json", action="store_true", help="print a JSON document")
+    args = parser.parse_args(words)
+    try:
+        loaded = load_configuration(args.c)
+        findings = proof_of(loaded)
+    except UserError as error:
+        for problem in error.problems:
+            print(f"make prove: {problem}", file=sys.stderr)
+        return error.exit_code
+    if args.json:
+        print(json.dumps(asdict(findings), indent=2))
+    else:
+        for line in result_lines(args.c, loaded, findings, args.v):
+            print(line)
+    if findings.refuted:
+        return REFUTED
+    return NOT_PROVEN if findings.unproven else 0
+
+
+def proof_of(loaded: Loaded) -> Findings:
+    """Prove the DBC of a configuration. Raises UserError if no DBC is sent."""
+    if loaded.database is None:
+        raise UserError(
+            f"{loaded.config.file}: dbc.enabled is false, so there is nothing to prove. "
+            "Set it to true."
+        )
+    proof = Proof(loaded.database, loaded.layout, loaded.escs, loaded.config.dbc)
+    for name in proof.messages():
+        if sys.stderr.isatty():
+            print(f"\r\x1b[K{name}", end="", file=sys.stderr)
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr)
+    return proof.findings
+
+
+def result_lines(path: Path, loaded: Loaded, findings: Findings, is_long: bool) -> Iterator[str]:
+    """Yield the results of a proof. ``is_long``: with the names of all proven signals."""
+    proven = len(findings.proven)
+    total = proven + len(findings.unproven) + len(findings.refuted_signals)
+    core = "both cores"
+    if findings.only_python:
+        core = f"the core in Python, because the core in C cannot run: {findings.only_python}"
+    yield f"{path}: layout {loaded.layout.fingerprint} of version {__version__}"
+    yield f"  proof     {proven} of {total} signals proven for all values and settings"
+    yield f"            {core}"
+    for text in findings.refuted:
+        yield f"  REFUTED   {text}"
+    for text in findings.unproven:
+        yield f"  not proven: {text}"
+    if findings.without_code:
+        names = listed(findings.without_code, len(findings.without_code) if is_long else 3)
+        yield f'  no code for "not available", which is sent as a value: {names}'
+    if is_long:
+        for name in findings.proven:
+            yield f"  proven    {name}"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
