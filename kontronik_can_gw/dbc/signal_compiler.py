@@ -11,7 +11,7 @@ from kontronik_can_gw.dbc import e2e_attributes, names, raw_values
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.dbc.raw_values import ValueTable, exact, raw_range
-from kontronik_can_gw.dbc.reader import attribute
+from kontronik_can_gw.dbc.reader import attribute, listed
 from kontronik_can_gw.esc.values import Group, Value
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.e2e import DataIdMode, Protection
@@ -20,6 +20,10 @@ from kontronik_can_gw.signals.plan import Role, SignalPlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Signal
+
+
+_NUMBERS_WITH_TEXTS = frozenset({"operating_state_raw", "device_raw"})
+"""Numbers of states and devices, which a DBC may name."""
 
 
 class UnfitSignal(Exception):
@@ -133,6 +137,13 @@ class SignalCompiler:
         signal = self.signal
         table = self.table
         factor, offset, limits = self._scale()
+        first = signal.minimum or 0
+        last = signal.maximum or 0
+        if limits is not None and first > last:
+            self.job.warnings.append(
+                f"{self._where}: its minimum {first:g} is above its maximum {last:g}, so the two "
+                "are exchanged. Correct the DBC."
+            )
         low, high = raw_range(signal)
         if limits is not None:
             low = max(low, math.ceil(limits[0]))
@@ -257,7 +268,25 @@ class SignalCompiler:
         plan = _bound_plan(plan, self.table, value, self._flag_on_loss())
         if value.unit and not plan.unit:
             self.job.warnings.append(f"{self._where}: has no unit, so {value.unit} is assumed.")
+        self.job.warnings += self._unknown_texts(plan, value)
         return replace(plan, esc=esc)
+
+    def _unknown_texts(self, plan: SignalPlan, value: Value) -> Iterator[str]:
+        """Yield a warning if a number may be sent that has a text without a meaning here."""
+        is_number = not plan.numbers and not value.names and value.bit is None
+        if not is_number or value.name in _NUMBERS_WITH_TEXTS:
+            return
+        unknown = [
+            f"{raw} {text!r}"
+            for raw, text in self.table.texts.items()
+            if plan.is_float or plan.low <= raw <= plan.high
+        ]
+        if unknown:
+            yield (
+                f"{self._where}: its value table has the texts {listed(unknown, 4)}, which have no "
+                "meaning to the gateway, so a value may be sent with such a number. Exclude it by "
+                "the limits, or call a code NotAvailable or Error."
+            )
 
     def _start_value(self, plan: SignalPlan) -> int:
         """Return the raw bits of an unbound signal.

@@ -63,6 +63,29 @@ def start_of(name: str, value: object, number: int = 256) -> str:
 # --- entries
 
 
+def test_each_unknown_text_of_a_number_within_its_limits_is_warned_about() -> None:
+    text = MESSAGE + signal("BatteryVoltage", "0|10@1+", "V", "0.1,0", "0|102.2")
+    text += signal("MotorCurrent", "16|16@1-", "A") + signal("OperatingStateRaw", "32|8@1+")
+    text += 'VAL_ 256 BatteryVoltage 1023 "SNA" 1022 "Fehler" 1021 "Init" 1020 "Invalid" ;\n'
+    text += 'VAL_ 256 MotorCurrent -32768 "NotAvailable" -32767 "Error" -32766 "Err" ;\n'
+    text += 'VAL_ 256 OperatingStateRaw 21 "Forward" ;\n'
+    (line,) = [line for line in compiled(text).warnings if "value table" in line]
+    assert "Power.BatteryVoltage: its value table has the texts 1022 'Fehler', 1021 'Init'" in line
+    within = text.replace("0|102.2", "0|102.1")
+    (line,) = [line for line in compiled(within).warnings if "value table" in line]
+    assert "the texts 1021 'Init', which" in line
+    without = text.replace("0|102.2", "0|102")
+    assert not [line for line in compiled(without).warnings if "value table" in line]
+
+
+def test_exchanged_limits_are_sorted_with_a_warning() -> None:
+    text = MESSAGE + signal("BatteryVoltage", "0|16@1+", "V", "0.1,0", "600|0")
+    (line,) = [line for line in compiled(text).warnings if "minimum" in line]
+    assert "Power.BatteryVoltage: its minimum 600 is above its maximum 0" in line
+    (plan,) = compiled(text).messages[0].signals
+    assert (plan.low, plan.high) == (0, 6000)
+
+
 def test_comments_and_value_texts_are_not_touched() -> None:
     comment = "first; one\nVAL_ 256 OperatingState States ;\nVAL_TABLE_ States 1 fake ;\nBA_ "
     text = f'{STATE}VAL_TABLE_ States 21 "Forward; bad" 12 "MotorOff" ;\nCM_ BO_ 256 "{comment}";\n'
