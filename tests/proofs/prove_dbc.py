@@ -57,7 +57,9 @@ def proof_of(loaded: Loaded) -> Findings:
             f"{loaded.config.file}: dbc.enabled is false, so there is nothing to prove. "
             "Set it to true."
         )
-    proof = Proof(loaded.database, loaded.layout, loaded.escs, loaded.config.dbc)
+    config = loaded.config
+    quiet_after_ns = config.can.quiet_after_ns
+    proof = Proof(loaded.database, loaded.layout, loaded.escs, config.dbc, quiet_after_ns)
     for name in proof.messages():
         if sys.stderr.isatty():
             print(f"\r\x1b[K{name}", end="", file=sys.stderr)

@@ -68,14 +68,20 @@ def rule_of_python(protection: Protection) -> CrcRule:
 
 def rule_of_c(row: Any) -> CrcRule:
     """Return the CRC of a row of kcg_e2e. One of 8 bits is the upper half of one of 16 bits."""
-    shift = 16 - 8 * row.crc_bytes
+    lower_half = 1 << 16 - 8 * row.crc_bytes
     mask = (1 << 8 * row.id_bytes) - 1
     return CrcRule(
-        polynomial=row.polynomial >> shift,
+        polynomial=_upper_half(row.polynomial, lower_half),
         bits=8 * row.crc_bytes,
-        start=row.start >> shift,
-        final_xor=row.final_xor >> shift,
+        start=_upper_half(row.start, lower_half),
+        final_xor=_upper_half(row.final_xor, lower_half),
         id_bytes=row.id_bytes,
         is_id_last=bool(row.is_id_last),
         data_ids=tuple(number & mask for number in row.data_id),
     )
+
+
+def _upper_half(number: int, lower_half: int) -> int:
+    """Return a number without its lower half, which must be 0. Otherwise it is negative."""
+    upper, lower = divmod(number, lower_half)
+    return -number if lower else upper

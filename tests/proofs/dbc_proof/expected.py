@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING, Any
 from dbc_proof.end_to_end import COUNTERS, CrcRule, expected_rule
 from dbc_proof.messages import SentMessage, sent_messages
 from dbc_proof.quantities import QUANTITIES, Quantity, size
+from dbc_proof.sending import Sending, attribute_of, has_own_attribute, letters_of, sending_of
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.e2e_attributes import role_of
 from kontronik_can_gw.dbc.names import Binder, is_data_id, protection
 from kontronik_can_gw.dbc.protection import stated_data_ids, stated_profile
-from kontronik_can_gw.dbc.reader import attribute
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import Role
 
@@ -132,6 +131,8 @@ class ExpectedMessage:
     multiplexer: tuple[int, ...]
     """Bits of the multiplexer. Empty without one."""
     signals: tuple[ExpectedSignal, ...]
+    sending: Sending | None
+    """None if the specification does not cover one of its values."""
 
 
 def expected_messages(
@@ -169,7 +170,30 @@ def _message(
         crc=None if protection is None else expected_rule(*protection),
         multiplexer=multiplexer,
         signals=tuple(signals),
+        sending=_sending(database, sent, settings, signals, len(pages) or 1),
     )
+
+
+def _sending(
+    database: "Database",
+    sent: SentMessage,
+    settings: DbcConfig,
+    signals: Sequence[ExpectedSignal],
+    pages: int,
+) -> Sending | None:
+    paces = set()
+    escs = set()
+    alive_values = 1
+    for signal in signals:
+        if signal.rule is None:
+            return None
+        if signal.rule.quantity is not None:
+            paces.add(signal.rule.quantity.pace)
+        if signal.rule.esc is not None:
+            escs.add(signal.rule.esc)
+        if signal.rule.shape is Shape.ALIVE:
+            alive_values = signal.rule.modulus
+    return sending_of(database, sent.message, settings, paces, pages, escs, alive_values)
 
 
 def _protection(
@@ -242,7 +266,7 @@ class _Signal:
         self.unit = _unit(signal, settings)
         texts: list[tuple[int, str]] = []
         for raw, text in (signal.choices or {}).items():
-            texts.append((int(raw), normalize(str(text))))
+            texts.append((int(raw), letters_of(str(text))))
         self.texts = texts
         self.start, self.start_is_set = self._start_value()
 
@@ -294,8 +318,8 @@ class _Signal:
 
         None if there is none, or if the signal cannot hold it.
         """
-        start = attribute(self.signal, "GenSigStartValue", self.database)
-        own = self.signal.dbc is not None and "GenSigStartValue" in self.signal.dbc.attributes
+        start = attribute_of(self.signal, "GenSigStartValue", self.database)
+        own = has_own_attribute(self.signal, "GenSigStartValue")
         if not isinstance(start, (int, float)):
             return None, own
         if self.signal.is_float:
@@ -324,7 +348,7 @@ class _Signal:
         minimum = maximum = None
         limits = (signal.minimum, signal.maximum)
         if None not in limits and limits != (0, 0):
-            minimum, maximum = _exact(signal.minimum), _exact(signal.maximum)
+            minimum, maximum = sorted(map(_exact, limits))
         named = self._raws(_TEXTS_OF_NOT_AVAILABLE)
         errors = self._raws(_TEXTS_OF_ERROR)
         if named:
@@ -445,7 +469,7 @@ class _Signal:
         found = {}
         for number, name in names.items():
             for raw, text in self.texts:
-                if text == normalize(name):
+                if text == letters_of(name):
                     found[number] = raw
         return found
 

@@ -6,7 +6,7 @@ is. ``formulas`` gives them the meaning that signals/packer.py and native/core.c
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from dbc_proof.end_to_end import CrcRule, rule_of_c, rule_of_python
@@ -17,6 +17,8 @@ from dbc_proof.quantities import (
     Presence,
     Read,
 )
+from dbc_proof.sending import Sending
+from kontronik_can_gw.core.messages import Traits
 from kontronik_can_gw.esc import values
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -127,10 +129,15 @@ class PlannedMessage:
     """Byte of the CRC."""
     constants: Mapping[int | None, int]
     """Constant bits of a frame by page."""
-    signals: tuple[PlannedSignal, ...] = field(default=())
+    sending: Sending
+    signals: tuple[PlannedSignal, ...] = ()
+    wrong_rows: tuple[str, ...] = ()
+    """Numbers of the core in C that contradict each other."""
 
 
-def of_python(plan: MessagePlan, escs: Sequence[EscSettings]) -> PlannedMessage:
+def of_python(
+    plan: MessagePlan, escs: Sequence[EscSettings], is_silent: bool = False
+) -> PlannedMessage:
     """Return a message as signals/packer.py packs it."""
     crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
     constants = {}
@@ -154,6 +161,7 @@ def of_python(plan: MessagePlan, escs: Sequence[EscSettings]) -> PlannedMessage:
         else:
             continue
         signals.append(made)
+    traits = Traits(plan, is_silent)
     return PlannedMessage(
         can_id=plan.can_id,
         extended=plan.extended,
@@ -161,6 +169,19 @@ def of_python(plan: MessagePlan, escs: Sequence[EscSettings]) -> PlannedMessage:
         crc=None if plan.e2e is None else rule_of_python(plan.e2e),
         crc_at=0 if crc is None else crc.pieces[0].at // 8,
         constants=constants,
+        sending=Sending(
+            fd=plan.fd,
+            cycle_ns=plan.cycle_ns,
+            delay_ns=plan.delay_ns,
+            by_event=traits.by_event,
+            on_change=traits.on_change,
+            silent_on_loss=traits.is_silent_on_loss,
+            follows_gateway=traits.follows_gateway,
+            untimed=traits.is_untimed,
+            events=int(traits.triggers),
+            escs=tuple(sorted(plan.escs)),
+            alive_values=max(1, traits.alive_modulus),
+        ),
         signals=tuple(signals),
     )
 
@@ -223,44 +244,171 @@ def _python_plan(
     )
 
 
-def of_c(plan: MessagePlan, index: int, tables: Tables) -> PlannedMessage:
-    """Return message ``index`` as native/core.c packs it from its tables."""
+def of_c(
+    plan: MessagePlan, index: int, tables: Tables, pages: Sequence[int | None]
+) -> PlannedMessage:
+    """Return message ``index`` as native/core.c packs it from its tables.
+
+    ``pages`` are the multiplexer values of the DBC. The rows have their positions only.
+    """
     row = tables.messages[index]
+    names = [s.name for s in plan.signals if s.role in (Role.SOURCE, Role.ALIVE)]
+    wrong = [*_wrong_numbers(row, len(names), tables)]
     constants: dict[int | None, int] = {}
-    for number, page in enumerate(plan.pages):
+    for position in range(row.pages):
         bits = 0
         for word in range(row.words):
-            at = row.first_word + number * row.words + word
-            bits |= tables.constants[at] << 64 * word
-        constants[page] = bits
-    names = [s.name for s in plan.signals if s.role in (Role.SOURCE, Role.ALIVE)]
+            at = row.first_word + position * row.words + word
+            if at < len(tables.constants):
+                bits |= tables.constants[at] << 64 * word
+        constants[_page(pages, position)] = bits
     signals = []
-    for number, name in enumerate(names[: row.signals]):
-        signal = tables.signals[row.first_signal + number]
-        pieces = [
-            tables.pieces[place]
-            for place in range(signal.first_piece, signal.first_piece + signal.pieces)
-        ]
+    for number, name in enumerate(names):
+        at = row.first_signal + number
+        if number >= row.signals or at >= len(tables.signals):
+            break  # a wrong number, too
+        signal = tables.signals[at]
+        wrong += [f"{name}: {problem}" for problem in _wrong_numbers_of_signal(signal, tables)]
         is_alive = signal.kind == KCG.OF_ALIVE
         signals.append(
             PlannedSignal(
                 name,
-                None if signal.page == KCG.PAGES else plan.pages[signal.page],
-                tuple(_within_word(piece) for piece in pieces),
+                None if signal.page == KCG.PAGES else _page(pages, signal.page),
+                tuple(_within_word(piece) for piece in _rows(tables.pieces, signal, "piece")),
                 None if is_alive else _c_plan(signal, tables),
                 signal.div if is_alive else 0,
             )
         )
     extended = 1 << 31
+    crc = None
+    if row.flags & KCG.HAS_CRC and row.e2e < len(tables.e2e):
+        crc = rule_of_c(tables.e2e[row.e2e])
     return PlannedMessage(
         can_id=row.id & ~extended,
         extended=bool(row.id & extended),
         length=row.length,
-        crc=rule_of_c(tables.e2e[row.e2e]) if row.flags & KCG.HAS_CRC else None,
+        crc=crc,
         crc_at=row.crc_at,
         constants=constants,
+        sending=Sending(
+            fd=bool(row.fd_flags),
+            cycle_ns=row.cycle,
+            delay_ns=row.delay,
+            by_event=bool(row.flags & KCG.EVENT),
+            on_change=bool(row.flags & KCG.ON_CHANGE),
+            silent_on_loss=bool(row.flags & KCG.SILENT_ON_LOSS),
+            follows_gateway=bool(row.flags & KCG.OF_THE_GATEWAY),
+            untimed=bool(row.flags & KCG.FREE),
+            events=row.triggers,
+            escs=tuple(tables.esc_of[row.first_esc : row.first_esc + row.escs]),
+            alive_values=row.last_alive + 1,
+        ),
         signals=tuple(signals),
+        wrong_rows=tuple(wrong),
     )
+
+
+def _page(pages: Sequence[int | None], position: int) -> int | None:
+    """Return the multiplexer value at a position. A negative number if there is none."""
+    return pages[position] if position < len(pages) else -position
+
+
+def _rows(table: Any, owner: Any, name: str) -> list[Any]:
+    """Return the rows of a table that belong to a row, as far as the table has them."""
+    first = getattr(owner, f"first_{name}")
+    end = min(first + getattr(owner, f"{name}s"), len(table))
+    return [table[at] for at in range(first, end)]
+
+
+def _wrong_numbers(row: Any, signals: int, tables: Tables) -> Iterator[str]:
+    """Yield numbers of a row of kcg_message that no other description has."""
+    if row.signals != signals:
+        yield f"has {row.signals} signals with a value, not {signals}"
+    if row.words != max(1, -(-row.length // 8)):
+        yield f"has {row.words} words for {row.length} bytes"
+    if row.fd_flags > 1:
+        yield f"has the flags {row.fd_flags} of CAN FD"
+    if row.flags & (KCG.TRANSFER | KCG.PACED) or row.flags > 2 * KCG.PACED:
+        yield f"has the flags {row.flags:#x}"
+    if not 0 <= row.phase < max(1, row.cycle):
+        yield f"begins {row.phase} ns after the start, with a cycle of {row.cycle} ns"
+
+
+def _wrong_numbers_of_signal(row: Any, tables: Tables) -> Iterator[str]:
+    """Yield numbers of a row of kcg_signal that no other description has."""
+    if row.first_piece + row.pieces > len(tables.pieces) or not row.pieces:
+        yield f"has {row.pieces} parts from {row.first_piece} on"
+    if row.flags & KCG.TABLE and row.first_pair + row.pairs > len(tables.pairs):
+        yield f"has {row.pairs} names from {row.first_pair} on"
+    if row.state_place or row.negative_states:
+        yield f"is negative in states {row.negative_states:#x} of byte {row.state_place}"
+    if row.kind == KCG.OF_ALIVE and row.esc != ALL_ESCS:
+        yield f"is an alive counter of ESC {row.esc}"
+
+
+def wrong_tables(
+    expected: Sequence[tuple[int, Sending | None]], tables: Tables, quiet_after_ns: int
+) -> Iterator[str]:
+    """Yield numbers of kcg_plan and its tables that contradict the messages.
+
+    ``expected`` has the number of pages and the timing of each message.
+    """
+    counts = tables.counts
+    wanted = {
+        "words": len(tables.constants),
+        "messages": len(expected),
+        "escs": len(tables.settings),
+        "pages": sum(pages for pages, _ in expected),
+        "slots": 0,
+        "quiet_after": quiet_after_ns,
+    }
+    for name, number in counts.items():
+        if number != wanted.get(name):
+            yield f"{name} is {number}, not {wanted.get(name)}"
+    phases: dict[tuple[int, int], int] = {}
+    words = list[int]()
+    pages = list[int]()
+    escs = list[int]()
+    for number, row in enumerate(tables.messages):
+        words += range(row.first_word, row.first_word + row.pages * row.words)
+        pages += range(row.first_page, row.first_page + row.pages)
+        escs += range(row.first_esc, row.first_esc + row.escs)
+        if row.cycle and phases.setdefault((row.cycle, row.phase), number) != number:
+            yield f"two messages with a cycle of {row.cycle} ns begin after {row.phase} ns"
+    for name, places, size in (
+        ("constant", words, len(tables.constants)),
+        ("page", pages, tables.pages),
+        ("esc_of", escs, len(tables.esc_of)),
+    ):
+        if sorted(places) != [*range(size)]:
+            yield f"the messages do not use each entry of {name} once"
+    for esc in range(len(tables.settings)):
+        wanted_listeners = [
+            number
+            for number, (_, sending) in enumerate(expected)
+            if sending is not None and sending.events and esc in sending.escs
+        ]
+        first, end = tables.first_listeners[esc : esc + 2]
+        known = {number for number, (_, sending) in enumerate(expected) if sending is not None}
+        listeners = [number for number in tables.listeners[first:end] if number in known]
+        if listeners != wanted_listeners:
+            yield f"events of ESC {esc} request the messages {listeners}, not {wanted_listeners}"
+
+
+def wrong_settings(escs: Sequence[EscSettings], tables: Tables) -> Iterator[str]:
+    """Yield settings of an ESC that differ from the configuration."""
+    for esc, row in zip(escs, tables.settings, strict=True):
+        wanted = {
+            "timeout": esc.timeout_ns,
+            "crc_errors": min(esc.crc_error_threshold, (1 << 32) - 1),
+            "poles": esc.pole_pairs,
+            "gear_numerator": esc.gear.numerator,
+            "gear_denominator": esc.gear.denominator,
+            "cells": esc.cell_count,
+        }
+        for name, number in wanted.items():
+            if getattr(row, name) != number:
+                yield f"{esc.name}: {name} is {getattr(row, name)}, not {number}"
 
 
 def _within_word(piece: Any) -> Piece:
@@ -297,8 +445,7 @@ def _c_plan(row: Any, tables: Tables) -> Planned:
     numbers: dict[int, int] | None = None
     if flags & KCG.TABLE:
         numbers = {}
-        for at in range(row.first_pair, row.first_pair + row.pairs):
-            pair = tables.pairs[at]
+        for pair in _rows(tables.pairs, row, "pair"):
             numbers.setdefault(pair.number, pair.raw)
     scale = None
     if not flags & KCG.PLAIN and numbers is None:

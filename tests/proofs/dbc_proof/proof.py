@@ -1,7 +1,7 @@
 """Proves each signal of a compiled DBC, or finds counter-examples."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,8 @@ from dbc_proof.planned import (
     of_c,
     of_python,
     products,
+    wrong_settings,
+    wrong_tables,
 )
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -79,20 +81,25 @@ class Proof:
         layout: Layout,
         escs: Sequence[EscSettings],
         settings: DbcConfig,
+        quiet_after_ns: int = 0,
     ) -> None:
         self.findings = Findings()
         self._layout = layout
         self._escs = escs
         self._expected = [*expected_messages(database, escs, settings)]
-        self._tables: Tables | None = None
+        self._prover = Prover(escs)
+        self._is_silent = settings.silent_on_loss
+        self._quiet_after_ns = quiet_after_ns
+        self.tables: Tables | None = None
+        """The numbers that the core in C gets. None if it cannot send the layout."""
         try:
-            self._tables = Tables(layout, escs, settings.silent_on_loss)
+            self.tables = Tables(layout, escs, self._is_silent, quiet_after_ns)
         except NotInCore as error:
             self.findings.only_python = str(error)
 
     def messages(self) -> Iterator[str]:
         """Prove one message after the other. Yields the name of each before it is proven."""
-        prover = Prover(self._escs)
+        self.findings = Findings(only_python=self.findings.only_python)
         plans: dict[str, list[int]] = {}
         for number, plan in enumerate(self._layout.messages):
             plans.setdefault(plan.name, []).append(number)
@@ -107,12 +114,18 @@ class Proof:
                 self.findings.refuted.append(f"{expected.name}: is sent {len(numbers)} times")
             number = numbers[0]
             plan = self._layout.messages[number]
-            cores = [of_python(plan, self._escs)]
-            if self._tables is not None:
-                cores.append(of_c(plan, number, self._tables))
-            prover.prove(expected, cores, self.findings)
+            cores = [of_python(plan, self._escs, self._is_silent)]
+            if self.tables is not None:
+                cores.append(of_c(plan, number, self.tables, expected.pages))
+            self._prover.prove(expected, cores, self.findings)
         for name in plans:
             self.findings.refuted.append(f"{name}: is sent, but is not a message of the gateway")
+        if self.tables is not None:
+            by_name = {each.name: (len(each.pages), each.sending) for each in self._expected}
+            known = [by_name[plan.name] for plan in self._layout.messages if plan.name in by_name]
+            wrong = [*wrong_tables(known, self.tables, self._quiet_after_ns)]
+            wrong += wrong_settings(self._escs, self.tables)
+            self.findings.refuted += [f"tables of the core in C: {text}" for text in wrong]
 
     def complete(self) -> Findings:
         """Prove all messages, and return the findings."""
@@ -197,6 +210,8 @@ class Prover:
             return
         (planned,) = found
         yield from _wrong_bits(signal, rule, planned.pieces)
+        if planned.planned is not None and planned.planned.length != rule.length:
+            yield f"is sent as a number of {planned.planned.length} bits, not {rule.length}"
         if rule.shape is Shape.ALIVE:
             if planned.planned is not None or planned.modulus != rule.modulus:
                 yield f"counts {planned.modulus} frames before it restarts, not {rule.modulus}"
@@ -273,6 +288,12 @@ def _frame_problems(expected: ExpectedMessage, plan: PlannedMessage) -> Iterator
         yield f"is sent with CAN id {_id(plan)}, not {_id(expected)}"
     if plan.length != expected.length:
         yield f"is sent with {plan.length} bytes, not {expected.length}"
+    yield from plan.wrong_rows
+    if expected.sending is not None:
+        for name, wanted_number in asdict(expected.sending).items():
+            number = getattr(plan.sending, name)
+            if number != wanted_number:
+                yield f"has {name.replace('_', ' ')} {number}, not {wanted_number}"
     if plan.crc is not None and expected.crc is not None:
         for name, number, wanted in zip(CrcRule._fields, plan.crc, expected.crc, strict=True):
             if number != wanted:

@@ -26,6 +26,8 @@ _MOST_ENERGY = 1 << 55
 _MOST_NS = 1 << 61
 """Limit of a time in ns."""
 _JIVEPRO = 3
+_BY_LIVE_DATA = ("energy_used", "motor_run_time")
+"""Sums that increase with live data."""
 
 
 class Presence(Enum):
@@ -37,6 +39,15 @@ class Presence(Enum):
     AFTER_LIVE = "a live frame was received"
     RATED = "the rate is known"
     ALWAYS = "always"
+
+
+class Pace(Enum):
+    """The event by which a value changes."""
+
+    LIVE = "live data"
+    INFO = "info data"
+    LINK = "a state or counter of the link, or a second"
+    GATEWAY = "the gateway"
 
 
 class Divisor(Enum):
@@ -80,6 +91,16 @@ class Quantity:
     """Devices that do not supply the value."""
     rolls: bool = False
     """True for a counter that restarts at 0 after the greatest value of its signal."""
+    of_gateway: bool = False
+
+    @property
+    def pace(self) -> Pace:
+        if self.of_gateway:
+            return Pace.GATEWAY
+        if self.read.source == "info":
+            return Pace.INFO
+        of_live = self.presence is Presence.LIVE or self.read.source in _BY_LIVE_DATA
+        return Pace.LIVE if of_live else Pace.LINK
 
     @property
     def is_flag(self) -> bool:
@@ -149,19 +170,23 @@ test_eeprom_checksum test_eeprom_size test_eeprom_version
 """
 """The flags of the self-test errors, from bit 0."""
 _COUNTERS = """
-losses crc_errors dropped_bytes live_frames info_frames received_bytes suspect_frames sent_frames
-replaced_frames send_failures received_frames bus_off_count dropped_frames id_conflicts
-can_restarts
+losses crc_errors dropped_bytes live_frames info_frames received_bytes suspect_frames
+"""
+_COUNTERS_OF_GATEWAY = """
+sent_frames replaced_frames send_failures received_frames bus_off_count dropped_frames
+id_conflicts can_restarts
 """
 _STATES = """
 link_state 5
 layout 2
+"""
+"""Name and greatest number."""
+_STATES_OF_GATEWAY = """
 gateway_state 4
 can_state 5
 esc_count 255
 escs_ok 255
 """
-"""Name and greatest number."""
 _NOT_ON_JIVEPRO = {"bec_current", "max_bec_current"}
 _PRODUCT = Read("battery voltage times battery current")
 _MS_PER_S = 1000
@@ -235,13 +260,17 @@ def _measured() -> dict[str, Quantity]:
             always,
             "s",
             _MS_PER_S,
+            of_gateway=True,
         ),
     }
-    for name in _COUNTERS.split():
-        found[name] = Quantity(Read(name), 0, _MOST_COUNTED, always, rolls=True)
-    for line in _STATES.split("\n")[1:-1]:
-        name, most = line.split()
-        found[name] = Quantity(Read(name), 0, int(most), always)
+    for names, of_gateway in ((_COUNTERS, False), (_COUNTERS_OF_GATEWAY, True)):
+        for name in names.split():
+            most = _MOST_COUNTED
+            found[name] = Quantity(Read(name), 0, most, always, rolls=True, of_gateway=of_gateway)
+    for lines, of_gateway in ((_STATES, False), (_STATES_OF_GATEWAY, True)):
+        for line in lines.split("\n")[1:-1]:
+            name, number = line.split()
+            found[name] = Quantity(Read(name), 0, int(number), always, of_gateway=of_gateway)
     return found
 
 
