@@ -35,7 +35,7 @@ _HALF = Fraction(1, 2)
 
 
 class Shape(Enum):
-    """The rule by which a signal gets its raw value."""
+    """How the raw value of a signal is computed."""
 
     NUMBER = "number"
     FLAG = "flag in one bit"
@@ -49,7 +49,7 @@ class Shape(Enum):
 
 @dataclass(frozen=True)
 class Expected:
-    """The meaning of a signal's raw values, and the rule by which they are sent."""
+    """The meaning of a signal's raw values, and how they are computed."""
 
     shape: Shape
     length: int

@@ -41,7 +41,7 @@ class Settings:
     cells: int = 1
 
     def ratio(self, divisor: Divisor) -> Fraction:
-        """Return the number by which steps are divided."""
+        """Return the number that divides the steps."""
         by = {
             Divisor.ONE: Fraction(1),
             Divisor.POLES: Fraction(self.poles),

@@ -1,6 +1,6 @@
 """The messages that a gateway sends, derived a second time from a DBC and its configuration.
 
-The rules are those of docs/your-own-dbc.md and of the keys of [dbc]. Nothing here uses the names,
+docs/your-own-dbc.md and the keys of [dbc] have the rules. Nothing here uses the names,
 ids and copies that the compiler made. Only the meaning of a signal's name is the compiler's, too.
 """
 
@@ -39,7 +39,7 @@ class SentMessage:
 
     @property
     def for_binder(self) -> Copy:
-        """The message in the form in which the compiler's code looks up its bindings."""
+        """The message in the form that the compiler's code needs to look up its bindings."""
         return Copy(self.message, self.can_id - self.message.frame_id, self.esc, self.prefix)
 
 
@@ -141,7 +141,7 @@ def _copied_for_each_esc(
 def _smallest_step(
     fixed: set[tuple[int, bool]], moved: Sequence[tuple[int, bool]], count: int
 ) -> int:
-    """Return the smallest distance of the ESCs with which no id is used twice.
+    """Return the smallest distance of the ESCs that lets no id be used twice.
 
     ``fixed`` and ``moved`` contain the ids of messages that are sent once and for each ESC, and
     True for 29 bits.

@@ -42,7 +42,7 @@ class Presence(Enum):
 
 
 class Pace(Enum):
-    """The event by which a value changes."""
+    """The event that changes a value."""
 
     LIVE = "live data"
     INFO = "info data"
@@ -51,7 +51,7 @@ class Pace(Enum):
 
 
 class Divisor(Enum):
-    """The setting by which a number of steps is divided."""
+    """The setting that divides a number of steps."""
 
     ONE = "1"
     POLES = "pole pairs"

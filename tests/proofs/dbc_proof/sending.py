@@ -1,7 +1,7 @@
 """When the frames of a message are sent, derived a second time from a DBC and its configuration.
 
-The rules are those of docs/your-own-dbc.md ("Timing") and of the keys of [dbc]. Only the spellings
-of send types are the file of the package.
+docs/your-own-dbc.md ("Timing") and the keys of [dbc] have the rules. Only the spellings of send
+types are read from the package.
 """
 
 from collections.abc import Collection
@@ -21,7 +21,7 @@ _CYCLE_TIMES = ("GenMsgCycleTime", "GenMsgCycleTimeFast", "GenMsgCycleTimeActive
 _SECOND = 8
 """Event: a second of the statistics has ended."""
 _EVENTS = {Pace.LIVE: 1, Pace.INFO: 2, Pace.LINK: 4, Pace.GATEWAY: 0}
-"""Event of an ESC by which values of a pace change."""
+"""Event of an ESC that changes the values of a pace."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def has_own_attribute(owner: Any, name: str) -> bool:
 
 
 def letters_of(text: str) -> str:
-    """Return the letters and digits by which names and texts of a DBC are compared."""
+    """Return letters and digits. Only they count when texts of a DBC are compared."""
     return "".join(filter(str.isalnum, text.lower()))
 
 
@@ -81,7 +81,7 @@ def sending_of(
     escs: Collection[int],
     alive_values: int,
 ) -> Sending:
-    """Return the timing of a message. ``paces`` and ``escs`` are those of its values."""
+    """Return the timing of a message. Its values have the ``paces`` and ``escs``."""
     cycle_ns = 0
     for name in _CYCLE_TIMES:
         cycle_ns = cycle_ns or _time_ns(attribute_of(message, name, database))
