@@ -2,8 +2,8 @@
 
 Each command has a module, which is imported only if the command is given.
 
-Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration. Data is written to
-standard output, messages to standard error.
+Exit codes: 0 done, 1 failed while running, 2 wrong usage or configuration, 130 ended by Ctrl-C, 141
+the reader of the output has ended. Data is written to standard output, messages to standard error.
 """
 
 import argparse
@@ -31,6 +31,8 @@ _CLOSED_OUTPUT = 128 + signal.SIGPIPE
 
 A shell shows this code for a program that SIGPIPE ended.
 """
+_INTERRUPTED = 128 + signal.SIGINT
+"""Exit code after Ctrl-C."""
 COMMANDS = {
     "demo": "show a simulated ESC on a simulated CAN bus, no hardware needed",
     "run": "run the gateway: send ESC telemetry as DBC messages, CANopen and DroneCAN",
@@ -55,6 +57,8 @@ COMMANDS = {
     "describe": "describe the messages, objects and errors of the gateway, with remedies",
     "completion": "print the completion script of a shell",
 }
+FIRST_COMMANDS = ("demo", "init", "check", "doctor", "run", "status", "monitor", "convert")
+"""The commands that the help of a call without a command shows."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -64,13 +68,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of the output has ended, for example `| head`
         discard_output()
         return _CLOSED_OUTPUT
+    except KeyboardInterrupt:
+        return _INTERRUPTED
 
 
 def _run(words: list[str]) -> int:
-    """Run one command. Raises BrokenPipeError if a reader has closed its output or messages."""
+    """Run one command.
+
+    Raises BrokenPipeError if a reader has closed its output or messages, and KeyboardInterrupt.
+    """
     command = next((word for word in words if not word.startswith("-")), None)
     try:
         _prepare_streams()
+        if not words:
+            print(_short_help(), file=sys.stderr)
+            return UserError.exit_code
         refuse_removed_options(command, words)
         args = _parsed(command, words)
         # until here, while modules were loaded, Ctrl-C ended the process (see __main__)
@@ -98,9 +110,27 @@ def _run(words: list[str]) -> int:
             say(f"{error.filename}: {error.strerror}", command)
         else:
             raise
-    except KeyboardInterrupt:
-        return 130
     return RunError.exit_code
+
+
+def _short_help() -> str:
+    """Return the usage and the most useful commands."""
+    from textwrap import fill  # only needed here
+
+    rows = [
+        fill(f"  {name:8} {COMMANDS[name]}", 80, subsequent_indent=" " * 11)
+        for name in FIRST_COMMANDS
+    ]
+    return "\n".join(
+        [
+            "usage: kontronik-can-gw COMMAND ...",
+            "",
+            *rows,
+            "",
+            "kontronik-can-gw --help lists all commands.",
+            "kontronik-can-gw COMMAND --help describes one.",
+        ]
+    )
 
 
 def _parsed(command: str | None, words: list[str]) -> argparse.Namespace:

@@ -3,6 +3,7 @@
 import argparse
 import tomllib
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -220,7 +221,7 @@ def refuse_removed_options(command: str | None, words: Sequence[str]) -> None:
             break
         parts += word.split("=", 1) if word.startswith("--") else [word]
     before = ""
-    for part, value in zip(parts, [*parts[1:], ""], strict=True):
+    for part, value in pairwise([*parts, ""]):
         is_action = before == command
         before = part
         if not part.startswith("-") and not is_action:

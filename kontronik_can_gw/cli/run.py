@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -79,6 +79,10 @@ def main(args: argparse.Namespace) -> int:
     return refused.exit_code
 
 
+class _StoppedAtStart(BaseException):
+    """Ends the reading of files, which may wait forever, for example for a pipe."""
+
+
 class _Run:
     """One run of the gateway, from its configuration to its end."""
 
@@ -89,12 +93,18 @@ class _Run:
         self._signals: list[str] = []
         """Name of the signal that ends the run."""
         self._is_stopping = False
+        self._is_reading = False
+        """Whether files are being read, and nothing is open that must be closed in order."""
         self._recorder: Recorder | None = None
 
     def main(self) -> None:
         """Run until a signal ends the gateway."""
         sys.setswitchinterval(_LOCK_SWITCH_S)
-        with self._marking_on_signal(), stopping_on_signals(self._stop) as self._signals:
+        with (
+            self._marking_on_signal(),
+            suppress(_StoppedAtStart),
+            stopping_on_signals(self._stop) as self._signals,
+        ):
             loop = self._opened()
             self._loop = loop
             if self._is_stopping:  # a signal was received before the loop existed
@@ -124,6 +134,8 @@ class _Run:
         self._notifier.stopping()
         if self._loop is not None:
             self._loop.stop(self._reason())
+        if self._is_reading:
+            raise _StoppedAtStart
 
     def _reason(self) -> str:
         """Return the reason why the gateway ends."""
@@ -139,12 +151,14 @@ class _Run:
         from kontronik_can_gw.runtime.status.statistics import open_statistics
         from kontronik_can_gw.runtime.system.clock import ClockWatch
 
+        self._is_reading = True
         path = config_file(self._args.config)
         program = program_facts(path)
         # the objects of cantools are not needed any more, so the core can use their memory
         loaded = replace(load_all(path, _parameter_store), database=None)
         if loaded.outputs:
             gc.collect()  # frees the nodes that were built only for the check
+        self._is_reading = False
         config = loaded.config
         wait = self._args.wait or config.run.wait_for_devices
         _begin_realtime(config.run.realtime_priority, wait)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import run
 
-from kontronik_can_gw.cli import COMMANDS, make_parser
+from kontronik_can_gw.cli import COMMANDS, FIRST_COMMANDS, make_parser
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -57,6 +57,18 @@ def test_dronecan_is_named_in_every_description_of_the_program() -> None:
         "project": re.findall("(?m)^description = .*", project)[0],
     }
     assert [name for name, text in texts.items() if "DroneCAN" not in text] == []
+
+
+def test_a_call_without_arguments_shows_the_short_help() -> None:
+    done = run()
+    assert done.code == 2
+    assert done.out == ""
+    lines = done.err.splitlines()
+    assert lines[0] == "usage: kontronik-can-gw COMMAND ..."
+    assert [line.split()[0] for line in lines if re.match("  [a-z]", line)] == list(FIRST_COMMANDS)
+    assert set(FIRST_COMMANDS) <= set(COMMANDS)
+    assert [line for line in lines if len(line) > 80] == []
+    assert "kontronik-can-gw --help lists all commands." in lines
 
 
 @pytest.mark.parametrize(

@@ -3,14 +3,18 @@
 They never cause a traceback.
 """
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from kontronik_can_gw import cli
 
 LIMITED = 'ulimit -n "$0" && exec "$@"'
 INTERRUPTED = """
@@ -131,3 +135,43 @@ def test_too_few_open_files_are_reported_in_one_line(folder: Path) -> None:
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1
     assert "Too many open files" in done.stderr
+
+
+def test_ctrl_c_while_a_mistake_is_reported_causes_no_traceback(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "say", interrupted)
+    assert cli.main(["check", "-c", "missing.toml"]) == 130
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_gateway_that_waits_for_its_configuration(
+    number: signal.Signals,
+    folder: Path,
+) -> None:
+    """A pipe without a writer is like a file on a server that does not answer."""
+    pipe = folder / "pipe"
+    os.mkfifo(pipe)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "kontronik_can_gw", "run", str(pipe)],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    writer = None
+    try:
+        while writer is None:
+            assert process.poll() is None
+            time.sleep(0.01)
+            with contextlib.suppress(OSError):  # until the gateway opens the pipe
+                writer = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
+        process.send_signal(number)
+        _, said = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        if writer is not None:
+            os.close(writer)
+    assert (process.returncode, said) == (0, "")
