@@ -29,7 +29,7 @@ LIMITS: dict[str, dict[str, float]] = {
         "that-of": 0.6,
         "where-for-if": 0.3,
         "fragment-of": 0.2,
-        "animated": 2.4,
+        "animated": 2.2,
         "nobody-none": 0.4,
         "but-for": 0.4,
         "lines over 100 columns": 0,
