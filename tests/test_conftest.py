@@ -7,9 +7,11 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from built import ASK, PROGRAMS, there
 
 from kontronik_can_gw.runtime.system.folders import runtime_folder
 
@@ -31,6 +33,25 @@ def run_ignoring(script: str) -> subprocess.CompletedProcess[str]:
         timeout=60,
         check=False,
     )
+
+
+def test_a_test_that_does_not_ask_for_a_compiler_finds_none() -> None:
+    """So a machine without a compiler needs no run to show that such a test asks for one."""
+    for name in PROGRAMS:
+        done = subprocess.run([name, "--version"], capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (1, f"{ASK}\n")
+        with pytest.raises(pytest.fail.Exception, match="c_compiler"):
+            there(name)
+
+
+def test_a_test_that_asks_for_a_compiler_can_use_it(
+    c_compiler: Callable[..., str],
+    tmp_path: Path,
+) -> None:
+    source = tmp_path / "seven.c"
+    source.write_text("int main(void) { return 7; }\n")
+    subprocess.run([c_compiler(), "-o", tmp_path / "seven", source], check=True)
+    assert subprocess.run([tmp_path / "seven"], check=False).returncode == 7
 
 
 def test_children_of_tests_have_default_signals_under_nohup() -> None:

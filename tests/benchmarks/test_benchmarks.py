@@ -9,6 +9,7 @@ from programs import Context, Figure, LeftOut
 
 
 @pytest.mark.extended
+@pytest.mark.usefixtures("c_compiler")
 def test_a_short_run_of_the_three_programs_gives_a_table(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,

@@ -249,13 +249,8 @@ def test_measurements_do_not_need_python() -> None:
     assert len(bench.of("StatusExtended")) in (2 * 200, 2 * 201)
 
 
-@pytest.mark.parametrize("is_pure", ["0", "1"])
-def test_a_bus_that_is_too_slow_gets_complete_transfers(
-    is_pure: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_bus_that_is_too_slow_gets_complete_transfers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Newer values of two ESCs replace waiting ones, but a transfer that began is completed."""
-    monkeypatch.setenv("KONTRONIK_PURE", is_pure)
     world = wire_world.World(2)
     setup = loaded(2)
     layout = Layout("", "", ())

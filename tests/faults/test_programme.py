@@ -64,6 +64,7 @@ def test_both_reports_contain_the_states(
 
 
 @pytest.mark.extended
+@pytest.mark.usefixtures("c_compiler")
 def test_a_machine_with_virtual_time_sleeps_an_hour_at_once() -> None:
     busy = "import time; end = time.monotonic() + 0.1\nwhile time.monotonic() < end: pass"
     command = [

@@ -8,11 +8,11 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
-from built import STRICT, there
+from built import STRICT
 
 PACKAGE = Path(__file__).resolve().parents[2] / "kontronik_can_gw"
 FIRST_OF_LIVE = "    electrical_speed: ElectricalSpeed = 0\n"
@@ -96,9 +96,9 @@ print(json.dumps({
     ids=["first byte of live data", "signed word of info"],
 )  # fmt: skip
 def test_new_field_is_in_both_cores_and_in_the_export(
-    tmp_path: Path, before: str, type_code: str, line: str
+    c_compiler: Callable[..., str], tmp_path: Path, before: str, type_code: str, line: str
 ) -> None:
-    compiler = there()
+    compiler = c_compiler()
     copy = _copied(tmp_path)
     fields = copy / "esc" / "kontronik" / "fields.py"
     text = fields.read_text(encoding="utf-8")
@@ -128,8 +128,8 @@ def test_new_field_is_in_both_cores_and_in_the_export(
     assert SENT[-1] in _values(filter(None, sent))
 
 
+@pytest.mark.usefixtures("c_compiler")
 def test_wire_type_that_c_cannot_read_does_not_compile(tmp_path: Path) -> None:
-    there()
     c_header = _copied(tmp_path) / "esc" / "kontronik" / "c_header.py"
     text = c_header.read_text(encoding="utf-8")
     last_type = '"I": "U32"}'

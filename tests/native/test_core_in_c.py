@@ -255,6 +255,7 @@ def test_the_rate_counts_at_most_100_million_frames_in_a_second(
     assert python.frame_rate == pytest.approx(10 * min(frames + 1, 100_000_000), rel=1e-6)
 
 
+@pytest.mark.usefixtures("c_compiler")
 def test_sorting_of_pending_messages_is_not_quadratic(tmp_path: Path) -> None:
     """Messages that became due earlier are marked last.
 
@@ -271,12 +272,14 @@ def test_sorting_of_pending_messages_is_not_quadratic(tmp_path: Path) -> None:
 
 
 @pytest.mark.extended
+@pytest.mark.usefixtures("c_compiler")
 def test_clang_compiles_every_source_without_a_warning(tmp_path: Path) -> None:
     """The fixture ``native_library`` does the same with gcc."""
     built(tmp_path / "core.so", *STRICT, "-O2", *OPTIONS, program="clang")
 
 
 @pytest.mark.extended
+@pytest.mark.usefixtures("c_compiler")
 def test_the_core_stays_in_its_memory_and_has_no_undefined_behaviour(tmp_path: Path) -> None:
     script = (
         "import pathlib, sys\nimport equality, offline_equality\n"
@@ -289,6 +292,7 @@ def test_the_core_stays_in_its_memory_and_has_no_undefined_behaviour(tmp_path: P
     assert all(int(count) > 200 for count in counts)
 
 
+@pytest.mark.usefixtures("c_compiler")
 def test_an_object_of_other_sources_is_refused_in_one_line(tmp_path: Path) -> None:
     options = [option.replace("KCG_DATA=64", "KCG_DATA=8") for option in OPTIONS]
     with pytest.raises(WrongObject, match="built from other sources"):

@@ -2,11 +2,12 @@
 
 import re
 import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from built import COMPILERS, STRICT, there
+from built import COMPILERS, STRICT
 from firmware import Case
 
 from kontronik_can_gw.cli import main
@@ -19,9 +20,11 @@ from kontronik_can_gw.native.export_c import exported
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_an_export_sends_the_frames_of_the_python_core(tmp_path: Path, seed: int) -> None:
+def test_an_export_sends_the_frames_of_the_python_core(
+    c_compiler: Callable[..., str], tmp_path: Path, seed: int
+) -> None:
     case = Case(tmp_path, seed)
-    sent = case.run(str(case.build(there("gcc"), "-O1")))
+    sent = case.run(str(case.build(c_compiler("gcc"), "-O1")))
     assert sent.count("\n") > 100
     assert sent == case.expected()
 
@@ -35,9 +38,11 @@ def test_an_export_sends_the_frames_of_the_python_core(tmp_path: Path, seed: int
         "-DKCG_DATA=64 -DKCG_FLOATS=1",
     ],
 )
-def test_all_macros_compile_without_a_warning(tmp_path: Path, program: str, options: str) -> None:
+def test_all_macros_compile_without_a_warning(
+    c_compiler: Callable[..., str], tmp_path: Path, program: str, options: str
+) -> None:
     bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
-    Case(tmp_path, 1, bus.layout, bus.escs).build(there(program), "-Os", *options.split())
+    Case(tmp_path, 1, bus.layout, bus.escs).build(c_compiler(program), "-Os", *options.split())
 
 
 def test_the_command_exports_the_messages_of_a_configuration(
@@ -131,12 +136,14 @@ def shipped_case(tmp_path: Path) -> Case:
     return Case(tmp_path, 1, bus.layout, bus.escs)
 
 
-def test_an_export_links_with_a_cpp_program(shipped_case: Case) -> None:
+def test_an_export_links_with_a_cpp_program(
+    c_compiler: Callable[..., str], shipped_case: Case
+) -> None:
     case = shipped_case
     (case.folder / "main.cpp").write_text(_FROM_CPP)
-    case.output(there("gcc"), "-std=c99", "-c", "core.c", "tables.c")
+    case.output(c_compiler("gcc"), "-std=c99", "-c", "core.c", "tables.c")
     case.output(
-        there("g++"),
+        c_compiler("g++"),
         "-Wall",
         "-Werror",
         "-o",
@@ -149,10 +156,12 @@ def test_an_export_links_with_a_cpp_program(shipped_case: Case) -> None:
 
 
 @pytest.mark.parametrize("option", ["-DKCG_DATA=64", "-DKCG_FOUND=3"])
-def test_files_that_differ_in_a_structure_do_not_link(shipped_case: Case, option: str) -> None:
+def test_files_that_differ_in_a_structure_do_not_link(
+    c_compiler: Callable[..., str], shipped_case: Case, option: str
+) -> None:
     """Otherwise the program would write beyond the memory that the other file reserves."""
     case = shipped_case
-    gcc = there("gcc")
+    gcc = c_compiler("gcc")
     case.output(gcc, "-std=c99", option, "-c", "core.c")
     words = [gcc, "-std=c99", "-o", "differs", "core.o", "tables.c", "example_main.c"]
     done = subprocess.run(
@@ -184,10 +193,12 @@ def test_files_that_differ_in_a_structure_do_not_link(shipped_case: Case, option
         ("-DKCG_SLOTS=1", 8),
     ],
 )
-def test_every_declared_function_is_defined(shipped_case: Case, option: str, count: int) -> None:
+def test_every_declared_function_is_defined(
+    c_compiler: Callable[..., str], shipped_case: Case, option: str, count: int
+) -> None:
     """core.c defines every function that core.h declares. Slots need KCG_SLOTS."""
     case = shipped_case
-    gcc = there("gcc")
+    gcc = c_compiler("gcc")
     header = case.output(gcc, "-std=c99", option, "-E", "-P", "core.h")
     declared = set(re.findall(r"(kcg_\w+)\([^;{}]*\);", header))
     case.output(gcc, "-std=c99", option, "-c", "core.c")
@@ -241,13 +252,15 @@ LOST = LinkState.LOST
 PORT_ERROR = LinkState.PORT_ERROR
 
 
-def test_the_example_survives_a_failed_uart_and_bus_off(shipped_case: Case) -> None:
+def test_the_example_survives_a_failed_uart_and_bus_off(
+    c_compiler: Callable[..., str], shipped_case: Case
+) -> None:
     case = shipped_case
     live = encode(LiveData(battery_voltage=2400), WireLayout.V4)
     text = _FAULTS.replace("LIVE", ", ".join(map(str, live)))
     (case.folder / "faults.c").write_text(text)
     case.output(
-        there("gcc"),
+        c_compiler("gcc"),
         "-std=c99",
         *STRICT,
         "-o",

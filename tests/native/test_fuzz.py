@@ -6,11 +6,12 @@ Each fuzzer runs for 30 s here, and for ten minutes in `make release` (KCG_FUZZ_
 import os
 import random
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import equality
 import pytest
-from built import run_sanitized, there
+from built import run_sanitized
 from firmware import Case
 
 SECONDS = int(os.environ.get("KCG_FUZZ_SECONDS", "30"))
@@ -23,7 +24,9 @@ pytestmark = pytest.mark.extended
 
 
 @pytest.mark.parametrize("layout", FUZZED)
-def test_any_bytes_and_times_do_no_harm(tmp_path: Path, layout: int) -> None:
+def test_any_bytes_and_times_do_no_harm(
+    c_compiler: Callable[..., str], tmp_path: Path, layout: int
+) -> None:
     """libFuzzer makes any calls.
 
     The core stays in its memory, has no undefined behaviour, and its deadlines advance.
@@ -41,7 +44,7 @@ def test_any_bytes_and_times_do_no_harm(tmp_path: Path, layout: int) -> None:
         (corpus / str(number)).write_bytes(b"".join(calls))
     program = tmp_path / "fuzz"
     sanitizers = "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"
-    command = [there("clang"), "-std=c99", "-g", "-O1", *sanitizers, "-I", str(case.folder)]
+    command = [c_compiler("clang"), "-std=c99", "-g", "-O1", *sanitizers, "-I", str(case.folder)]
     sources = [case.folder / "core.c", case.folder / "tables.c", HERE / "fuzz_bytes.c"]
     subprocess.run([*command, "-o", str(program), *sources], check=True)
     limits = f"-max_total_time={max(1, SECONDS // len(FUZZED))}", f"-seed={SEED}", "-max_len=4096"
@@ -57,6 +60,7 @@ def test_any_bytes_and_times_do_no_harm(tmp_path: Path, layout: int) -> None:
     print(done.stderr[-600:])
 
 
+@pytest.mark.usefixtures("c_compiler")
 def test_any_dbc_text_is_refused_or_read_equally(tmp_path: Path) -> None:
     """Changed DBC text is refused with a message, or both cores agree."""
     printed = run_sanitized(tmp_path, str(HERE / "fuzz_dbc.py"), str(SECONDS), str(SEED))

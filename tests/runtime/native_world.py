@@ -11,6 +11,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from built import there
+
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
@@ -61,9 +63,14 @@ class _Kernel(c.Structure):
     )
 
 
-@cache
 def library(flags: tuple[str, ...] = ("-O1",)) -> Any:
-    """Compile and load the C core with the fake kernel."""
+    """Return the C core with the fake kernel. It is compiled once."""
+    there()  # also for a test that is not the first one
+    return _compiled(flags)
+
+
+@cache
+def _compiled(flags: tuple[str, ...]) -> Any:
     names = [f"-D{call}=fake_{call}" for call in (*_CALLS, "sendmmsg")]
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder, "core.so")

@@ -17,7 +17,7 @@ import pytest
 
 from kontronik_can_gw.native.objects import shared_object
 
-pytestmark = pytest.mark.extended
+pytestmark = [pytest.mark.extended, pytest.mark.usefixtures("c_compiler")]
 
 HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parents[1]
