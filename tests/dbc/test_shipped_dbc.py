@@ -14,9 +14,9 @@ from typing import Any
 
 import cantools.database
 import pytest
+import specification
 from cantools.database.can import Database, Signal
 from dbc_bench import check_comments
-from esc import sheet
 from packer_oracle import CAN_STATES, GATEWAY_STATES, LAYOUTS, LINKS, get, pascal, put
 
 FILES = sorted((Path(__file__).parents[2] / "dbc").glob("*.dbc"))
@@ -27,7 +27,7 @@ CODES = ("NotAvailable", "Error")
 ENUMS = {
     "OperatingState": {
         number: text.replace("_", "").replace("RPM", "Rpm")
-        for number, text in sheet.OPERATING_STATES.items()
+        for number, text in specification.OPERATING_STATES.items()
     },
     "Device": {1: "Kosmik", 2: "Kolibri", 3: "JivePro", 4: "KontrolX", 5: "Uhv"},
     "Layout": LAYOUTS,
@@ -105,24 +105,24 @@ def test_everything_has_a_comment(file: Path) -> None:
 
 FIELDS = [
     field
-    for field in (*sheet.LIVE_FIELDS, *sheet.INFO_FIELDS)
+    for field in (*specification.LIVE_FIELDS, *specification.INFO_FIELDS)
     if not field.name.endswith(("_errors", "_state", "_variant", "_word"))
 ]
 
 
 @pytest.mark.parametrize("field", FIELDS, ids=lambda field: field.name)
-def test_a_signal_holds_every_step_of_its_field_in_the_sheet(field: sheet.Field) -> None:
+def test_a_signal_holds_every_step_of_its_field_in_the_sheet(field: specification.Field) -> None:
     name = pascal(field.name) + ("Percent" if field.unit == "%" else "")
     found = next(signal for signal in signals_of(SHIPPED) if signal.name == name)
     step = Decimal(1) / field.steps
     assert (found.unit or "") == field.unit.replace("µ", "u").replace("°", "deg")
     assert exact(found.scale, found.offset) == [step, Decimal(0)]
     codes = 2 if found.is_signed else 0
-    low, high = sheet.TYPE_RANGES[field.code]
+    low, high = specification.TYPE_RANGES[field.code]
     if field.code == "I":
         high = 1_000_000  # no motor turns faster
     without_codes = (low + codes, high - 2 + codes)
-    low, high = sheet.STATED_RANGES.get(field.name, without_codes)
+    low, high = specification.STATED_RANGES.get(field.name, without_codes)
     least, most = exact(found.minimum, found.maximum)
     assert least <= low * step
     assert high * step <= most

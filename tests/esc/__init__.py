@@ -1,4 +1,4 @@
 """Tests of kontronik_can_gw.esc.
 
-sheet.py and reference.py are independent of the tested package: they import nothing of it.
+reference.py is independent of the tested package: it imports nothing of it.
 """

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from functools import cache
 from typing import NamedTuple
 
-from .sheet import FORM_ROWS, FormRow
+from specification import FORM_ROWS, FormRow
 
 LONGEST_OF = {b"KODL": 40, b"KODI": 44}
 SHORTEST_FIRST = sorted(FORM_ROWS, key=lambda row: row.length)

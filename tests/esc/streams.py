@@ -2,14 +2,14 @@
 
 import random
 
+import specification
 from hypothesis import strategies as st
+from specification import FORM_ROWS, FormRow
 
 from kontronik_can_gw.esc.kontronik.codec import FORMS, Form
 from kontronik_can_gw.esc.kontronik.fields import Data
 
-from . import sheet
 from .reference import ambiguous, random_frame, seal
-from .sheet import FORM_ROWS, FormRow
 
 FRAGMENTS = [*b"K KO KOD KODL KODI KODK KODX KOKO KKOD KODKODI \0 \xff".split(b" ")]
 
@@ -49,7 +49,7 @@ def random_piece(source: random.Random) -> bytes:
     if choice < 6:
         return frame
     if choice == 6:
-        return source.choice([sheet.RECORDED_LIVE, sheet.RECORDED_INFO])
+        return source.choice([specification.RECORDED_LIVE, specification.RECORDED_INFO])
     if choice == 7:
         return source.choice([ambiguous("live"), ambiguous("info")])
     if choice == 8:  # truncated, at either end

@@ -1,4 +1,4 @@
-"""Fields, names and frame bytes, compared with sheet.py.
+"""Fields, names and frame bytes, compared with the protocol specification.
 
 Frames whose names contain RECORDED are recorded. All others are synthetic.
 """
@@ -6,8 +6,10 @@ Frames whose names contain RECORDED are recorded. All others are synthetic.
 import struct
 
 import pytest
+import specification
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from specification import FORM_ROWS, Bit, Field, FormRow
 
 from kontronik_can_gw.esc.decoder import ErrorBit, bit_texts
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
@@ -23,12 +25,11 @@ from kontronik_can_gw.esc.kontronik.fields import (
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 
-from . import reference, sheet
-from .sheet import FORM_ROWS, Bit, Field, FormRow
+from . import reference
 from .streams import form_of
 
 RECORDED: dict[bytes, LiveData | InfoData] = {
-    sheet.RECORDED_LIVE: LiveData(
+    specification.RECORDED_LIVE: LiveData(
         battery_voltage=2442,
         bec_voltage=8024,
         pwm_input=1001,
@@ -37,7 +38,7 @@ RECORDED: dict[bytes, LiveData | InfoData] = {
         operating_errors=0x0002_0000,
         operating_state=12,
     ),
-    sheet.RECORDED_INFO: InfoData(
+    specification.RECORDED_INFO: InfoData(
         device_and_variant=3 << 10 | 120,
         firmware_word=0x010E,
         cell_count=6,
@@ -55,8 +56,8 @@ form_rows = pytest.mark.parametrize("row", FORM_ROWS, ids=lambda row: f"{row.kin
 
 def fields_of(row: FormRow) -> tuple[DataType, list[Field]]:
     if row.kind == "live":
-        return LiveData, sheet.LIVE_FIELDS
-    return InfoData, sheet.INFO_FIELDS
+        return LiveData, specification.LIVE_FIELDS
+    return InfoData, specification.INFO_FIELDS
 
 
 def frame_in(wire: bytes) -> Frame:
@@ -83,7 +84,7 @@ def test_raw_values_survive_a_round_trip_with_any_reserved_bytes(
     row: FormRow, choice: st.DataObject
 ) -> None:
     data_type, fields = fields_of(row)
-    ranges = [st.integers(*sheet.TYPE_RANGES[field.code]) for field in fields]
+    ranges = [st.integers(*specification.TYPE_RANGES[field.code]) for field in fields]
     data = data_type(*choice.draw(st.tuples(*ranges)))
     size = row.crc_at - row.body_end
     body = b""
@@ -103,9 +104,9 @@ def test_raw_values_survive_a_round_trip_with_any_reserved_bytes(
 @pytest.mark.parametrize(
     ("frame", "offset", "name"),
     [
-        (sheet.RECORDED_LIVE, 32, "operating_state"),
-        (sheet.RECORDED_LIVE, 33, "timing"),
-        (sheet.RECORDED_INFO, 36, "max_bec_temperature"),
+        (specification.RECORDED_LIVE, 32, "operating_state"),
+        (specification.RECORDED_LIVE, 33, "timing"),
+        (specification.RECORDED_INFO, 36, "max_bec_temperature"),
     ],
 )
 def test_changed_unprotected_byte_is_delivered_and_maybe_suspect(
@@ -122,27 +123,30 @@ def test_changed_unprotected_byte_is_delivered_and_maybe_suspect(
 
 
 def test_field_has_type_unit_step_and_absence_of_the_sheet() -> None:
-    for data, fields in ((LiveData, sheet.LIVE_FIELDS), (InfoData, sheet.INFO_FIELDS)):
+    for data, fields in (
+        (LiveData, specification.LIVE_FIELDS),
+        (InfoData, specification.INFO_FIELDS),
+    ):
         for (name, row), field in zip(rows(data).items(), fields, strict=True):
             assert name == field.name
             assert row.wire == field.code
             assert row.unit == field.unit
             assert row.per_unit == field.steps
-            assert row.type_range == sheet.TYPE_RANGES[field.code]
+            assert row.type_range == specification.TYPE_RANGES[field.code]
             is_bec_current = name in ("bec_current", "max_bec_current")
             assert row.not_on == ({3} if is_bec_current else set())
 
 
 def test_devices_and_states_have_exactly_the_names_of_the_sheet() -> None:
-    assert KONTRONIK.devices == sheet.DEVICES
+    assert KONTRONIK.devices == specification.DEVICES
     states = {number: state.text for number, state in KONTRONIK.states.items()}
-    assert states == sheet.OPERATING_STATES
-    assert KONTRONIK.peak_current_of == sheet.PEAK_CURRENT_OF
+    assert states == specification.OPERATING_STATES
+    assert KONTRONIK.peak_current_of == specification.PEAK_CURRENT_OF
 
 
 @pytest.mark.parametrize(
     ("names", "bits"),
-    [(OperatingError, sheet.OPERATING_BITS), (SelfTestError, sheet.SELFTEST_BITS)],
+    [(OperatingError, specification.OPERATING_BITS), (SelfTestError, specification.SELFTEST_BITS)],
     ids=["operating", "selftest"],
 )
 def test_error_bit_has_the_meaning_of_the_sheet(names: type[ErrorBit], bits: list[Bit]) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from itertools import product
 
 import pytest
+import specification
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -17,7 +18,6 @@ from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 
-from . import sheet
 from .reference import certain_at, counters_of, form_row, frames_of
 from .streams import random_chunks, seeds, streams
 
@@ -194,10 +194,10 @@ def noise_without_kod(size: int) -> bytes:
     return random.Random(18).randbytes(size).replace(b"K", b"J")
 
 
-_SPOILT = bytearray(sheet.RECORDED_LIVE)
+_SPOILT = bytearray(specification.RECORDED_LIVE)
 _SPOILT[20] ^= 1
 BAD = bytes(_SPOILT)
-_BARE = sheet.RECORDED_LIVE[:34]
+_BARE = specification.RECORDED_LIVE[:34]
 LONGER = _BARE + zlib.crc32(_BARE).to_bytes(4, "little")
 DIAGNOSES: list[tuple[str, list[bytes]]] = [
     ("no bytes: ", [b""]),
@@ -242,11 +242,11 @@ DIAGNOSES: list[tuple[str, list[bytes]]] = [
     (
         "a header but no whole frame yet",
         [
-            sheet.RECORDED_LIVE[:4],
-            sheet.RECORDED_LIVE[:20],
-            sheet.RECORDED_LIVE[:30],
-            sheet.RECORDED_LIVE[:37],
-            noise_without_kod(10) + sheet.RECORDED_LIVE[:4],
+            specification.RECORDED_LIVE[:4],
+            specification.RECORDED_LIVE[:20],
+            specification.RECORDED_LIVE[:30],
+            specification.RECORDED_LIVE[:37],
+            noise_without_kod(10) + specification.RECORDED_LIVE[:4],
         ],
     ),
 ]
@@ -279,5 +279,5 @@ def test_live_frames_whose_crc_covers_34_bytes_are_counted_and_not_accepted() ->
     assert deframer.feed(LONGER * 60) + deframer.flush() == []
     assert deframer.counters.longer_crcs == 59  # the last one may be a longer frame's beginning
     recorded = Deframer()
-    assert len(recorded.feed(sheet.RECORDED_LIVE * 60 + bytes(8))) == 60
+    assert len(recorded.feed(specification.RECORDED_LIVE * 60 + bytes(8))) == 60
     assert recorded.counters.longer_crcs == 0

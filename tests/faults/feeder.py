@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, Self
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-from esc import sheet
+import specification
 
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
@@ -109,7 +109,7 @@ def info(identity: Identity, m: int) -> InfoData:
     )
 
 
-def physical(data: Any, fields: Sequence[sheet.Field]) -> dict[str, float]:
+def physical(data: Any, fields: Sequence[specification.Field]) -> dict[str, float]:
     return {field.name: getattr(data, field.name) / field.steps for field in fields}
 
 
@@ -120,7 +120,7 @@ def live_values(identity: Identity, n: int) -> dict[str, float]:
     The names are the DBC's signal names in snake case.
     """
     data = live(identity, n)
-    values = physical(data, sheet.LIVE_FIELDS)
+    values = physical(data, specification.LIVE_FIELDS)
     speed = values["electrical_speed"]
     voltage = values["battery_voltage"]
     return {
@@ -139,7 +139,7 @@ def info_values(identity: Identity, m: int) -> dict[str, float]:
     """Return the physical values of an info frame, and its self-test errors as "flags"."""
     data = info(identity, m)
     return {
-        **physical(data, sheet.INFO_FIELDS),
+        **physical(data, specification.INFO_FIELDS),
         "flags": data.selftest_errors,
         "variant": data.device_and_variant & 1023,
         "firmware_main": data.firmware_word >> 8,

@@ -1,7 +1,7 @@
 """Checks that the recorded values of flights and dialogues are right.
 
 judged_esc.py finds the data of the ESCs by brute force (with tests/esc/reference.py) and computes
-the correct values (with tests/esc/sheet.py and tests/signals/packer_oracle.py). cantools decodes
+the correct values (with tests/specification and tests/signals/packer_oracle.py). cantools decodes
 the frames. From the product the judge uses only the DBC of a configuration, as text.
 """
 
@@ -28,9 +28,9 @@ sys.path[:0] = [
 import drive  # noqa: E402
 import meaning  # noqa: E402
 import scenario  # noqa: E402
+import specification  # noqa: E402
 from cantools.database.can import Database  # noqa: E402
 from cantools.database.can.signal import Signal  # noqa: E402
-from esc import sheet  # noqa: E402
 from judged_esc import (  # noqa: E402
     INFO,
     LIVE,
@@ -237,8 +237,8 @@ def flags() -> dict[str, tuple[str, int]]:
     """
     found: dict[str, tuple[str, int]] = {}
     for message, word, bits in (
-        ("EscStatus", "operating_errors", sheet.OPERATING_BITS),
-        ("EscInfo", "selftest_errors", sheet.SELFTEST_BITS),
+        ("EscStatus", "operating_errors", specification.OPERATING_BITS),
+        ("EscInfo", "selftest_errors", specification.SELFTEST_BITS),
     ):
         signals = _dbc([]).get_message_by_name(message).signals
         single = [signal for signal in signals if signal.length == 1]

@@ -13,8 +13,9 @@ from itertools import accumulate
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import specification
 from cantools.database.can.signal import Signal
-from esc import reference, sheet
+from esc import reference
 from packer_oracle import KNOWN
 
 NS_PER_BYTE = 11 * 10**9 // 115_200
@@ -25,8 +26,8 @@ CONVERSIONS: dict[tuple[str, str], int | Fraction] = {
     ("A", "mA"): 1000,
     ("us", "ms"): Fraction(1, 1000),
 }
-LIVE = {f.name: f for f in sheet.LIVE_FIELDS}
-INFO = {f.name: f for f in sheet.INFO_FIELDS}
+LIVE = {f.name: f for f in specification.LIVE_FIELDS}
+INFO = {f.name: f for f in specification.INFO_FIELDS}
 OF_SETTINGS = {"motor_speed", "output_speed", "mean_cell_voltage"}
 """Values that depend on settings."""
 _DERIVED = {
@@ -166,7 +167,7 @@ def _search(
 
 def fields_of(kind: str, raw: bytes) -> Values:
     """Return the raw values of a frame's fields."""
-    listed = sheet.LIVE_FIELDS if kind == "live" else sheet.INFO_FIELDS
+    listed = specification.LIVE_FIELDS if kind == "live" else specification.INFO_FIELDS
     values = {}
     for one in listed:
         (values[one.name],) = struct.unpack_from(f"<{one.code}", raw, one.offset)

@@ -11,8 +11,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import specification
 from drive import CanFrame, Drive, frame, replayed, shipped_eds
-from esc import reference, sheet
+from esc import reference
 
 SECOND = 10**9
 INPUTS = Path(__file__).parent / "inputs"
@@ -67,11 +68,11 @@ def uart_bytes(words: list[str]) -> bytes:
         name, value = word.split("=")
         given[name] = int(value, 0)
     if kind == "live":
-        fields = sheet.LIVE_FIELDS
-        structure = sheet.LIVE_STRUCT
+        fields = specification.LIVE_FIELDS
+        structure = specification.LIVE_STRUCT
     else:
-        fields = sheet.INFO_FIELDS
-        structure = sheet.INFO_STRUCT
+        fields = specification.INFO_FIELDS
+        structure = specification.INFO_STRUCT
     names = [field.name for field in fields]
     assert set(given) <= set(names), f"no field of the sheet: {given}"
     values = [given.get(name, 0) for name in names]

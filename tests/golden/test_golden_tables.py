@@ -10,7 +10,8 @@ import judge
 import judged_esc
 import pytest
 import record
-from esc import reference, sheet
+import specification
+from esc import reference
 
 FLIGHTS = ("v4", "legacy", "damage", "wreckage", "swap", "extremes", "errors")
 """Flights of one ESC. Plain bytes have no times, so nothing in them becomes too old."""
@@ -31,13 +32,13 @@ def expected_rows(stream: bytes) -> list[Cells]:
 
 def expected_cells(values: judged_esc.Values) -> Cells:
     cells = {}
-    for field in sheet.LIVE_FIELDS:
+    for field in specification.LIVE_FIELDS:
         if field.name == NOT_COMPARED:
             continue
         unit = f" [{field.unit}]" if field.unit else ""
         cells[f"{field.name}{unit}"] = spelled(values[field.name], field.steps)
     state = values["operating_state"]
-    cells["operating_state"] = sheet.OPERATING_STATES.get(state, "")
+    cells["operating_state"] = specification.OPERATING_STATES.get(state, "")
     cells["operating_state_raw"] = str(state)
     for name, (word, bit) in judge.flags().items():
         if word in judged_esc.LIVE:

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 
-from esc.sheet import DEVICES
-from esc.sheet import OPERATING_STATES as STATES
+from specification import DEVICES
+from specification import OPERATING_STATES as STATES
 
 
 @dataclass(frozen=True)

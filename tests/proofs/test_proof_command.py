@@ -11,8 +11,8 @@ import pytest
 import z3  # type: ignore[import-untyped]
 from command_line import refused, written
 from dbc_proof import planned, proof
-from dbc_proof.quantities import QUANTITIES, Divisor
 from prove_dbc import main
+from specification.quantities import QUANTITIES, Divisor
 
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.signals.plan import Layout

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 from esc.reference import Found, frames_of
-from esc.sheet import LIVE_STRUCT
 from esc.streams import random_stream
 from recordings import convert, dump_bytes
+from specification import LIVE_STRUCT
 
 from kontronik_can_gw.capture.format import EntryKind
 from kontronik_can_gw.desk.recordings import bytes_input

@@ -1,7 +1,7 @@
 """Computes raw values of signals independently, and makes random DBC layouts and telemetry.
 
 Nothing here uses the package's tables of fields, units or positions. They are typed again from the
-telemetry sheet, here and in tests/esc/sheet.py, and bits are counted one by one. The package is
+telemetry sheet, here and in tests/specification, and bits are counted one by one. The package is
 used only to make telemetry objects from encoded frames.
 """
 
@@ -15,8 +15,8 @@ from fractions import Fraction
 from typing import Any
 
 import cantools.database
+import specification
 from cantools.database.can import Database
-from esc import sheet
 
 from kontronik_can_gw.core.esc_stream import EscStream
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
@@ -86,8 +86,8 @@ class Known:
     gateway: bool = False
 
 
-STATES = sheet.OPERATING_STATES
-DEVICES = sheet.DEVICES
+STATES = specification.OPERATING_STATES
+DEVICES = specification.DEVICES
 LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
 LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
 GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay", "Quiet")))
@@ -156,7 +156,7 @@ def _of(part: str, reckon: Callable[[EscTelemetry, Any], "int | Fraction | None"
     return read
 
 
-def _fields(part: str, fields: Sequence[sheet.Field]) -> dict[str, Known]:
+def _fields(part: str, fields: Sequence[specification.Field]) -> dict[str, Known]:
     """Return the sources of fields whose number is the value."""
     spelled = str.maketrans({"µ": "u", "°": "deg"})
 
@@ -240,13 +240,13 @@ def _uptime(_esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction:
 
 
 KNOWN: dict[str, Known] = {
-    **_fields("live", sheet.LIVE_FIELDS),
+    **_fields("live", specification.LIVE_FIELDS),
     "bec_current": Known("A", _of("live", _bec_current)),
     "operating_state": Known("", _of("live", lambda _, v: v.operating_state), STATES),
     "operating_state_raw": Known("", _of("live", lambda _, v: v.operating_state)),
     **_bits("live", "operating_errors", ERROR_BITS),
     **_bits("info", "selftest_errors", TEST_BITS),
-    **_fields("info", sheet.INFO_FIELDS[2:]),
+    **_fields("info", specification.INFO_FIELDS[2:]),
     "max_bec_current": Known("A", _of("info", _max_bec_current)),
     "device": Known("", _of("info", lambda _, i: i.device_and_variant >> 10), DEVICES),
     "device_raw": Known("", _of("info", lambda _, i: i.device_and_variant >> 10)),
@@ -805,18 +805,18 @@ def random_integer(rng: random.Random, low: int, high: int) -> int:
 
 
 def random_fields(rng: random.Random, types: str) -> list[int]:
-    return [random_integer(rng, *sheet.TYPE_RANGES[code]) for code in types]
+    return [random_integer(rng, *specification.TYPE_RANGES[code]) for code in types]
 
 
 def random_live(rng: random.Random) -> LiveData:
-    values = random_fields(rng, sheet.LIVE_STRUCT[1:])
+    values = random_fields(rng, specification.LIVE_STRUCT[1:])
     if rng.random() < 0.8:
         values[14] = rng.randint(0, 30)
     return LiveData(*values)
 
 
 def random_info(rng: random.Random) -> InfoData:
-    values = random_fields(rng, sheet.INFO_STRUCT[1:])
+    values = random_fields(rng, specification.INFO_STRUCT[1:])
     values[0] = rng.randint(0, 7) << 10 | rng.randrange(1024)
     values[3] = rng.choice((0, 1, 3, 6, 7, 12, 255))
     return InfoData(*values)

@@ -14,9 +14,10 @@ from enum import Enum
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
+from specification.quantities import QUANTITIES, Quantity, size
+
 from dbc_proof.end_to_end import COUNTERS, CrcRule, expected_rule
 from dbc_proof.messages import SentMessage, sent_messages
-from dbc_proof.quantities import QUANTITIES, Quantity, size
 from dbc_proof.sending import Sending, attribute_of, has_own_attribute, letters_of, sending_of
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.e2e_attributes import role_of

@@ -12,10 +12,10 @@ from fractions import Fraction
 from typing import Any
 
 import z3  # type: ignore[import-untyped]
+from specification.quantities import WIRE_RANGES, Divisor, Presence, Read
 
 from dbc_proof.expected import Expected, Shape
 from dbc_proof.planned import INT64_END, LARGEST, Planned
-from dbc_proof.quantities import WIRE_RANGES, Divisor, Presence, Read
 
 TIMEOUT_MS = 10_000
 """Time for one formula. z3 needs some milliseconds for almost all of them."""

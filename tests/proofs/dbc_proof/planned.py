@@ -9,14 +9,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dbc_proof.end_to_end import CrcRule, rule_of_c, rule_of_python
-from dbc_proof.quantities import (
+from specification.quantities import (
     HEADER,
     PRODUCT,
     Divisor,
     Presence,
     Read,
 )
+
+from dbc_proof.end_to_end import CrcRule, rule_of_c, rule_of_python
 from dbc_proof.sending import Sending
 from kontronik_can_gw.core.messages import Traits
 from kontronik_can_gw.esc import values

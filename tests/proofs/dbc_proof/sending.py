@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
+from specification.quantities import Pace
+
 import kontronik_can_gw.dbc
-from dbc_proof.quantities import Pace
 from kontronik_can_gw.config.output_keys import DbcConfig
 
 if TYPE_CHECKING:

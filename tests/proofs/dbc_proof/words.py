@@ -2,9 +2,10 @@
 
 from fractions import Fraction
 
+from specification.quantities import Divisor, Presence
+
 from dbc_proof.expected import Expected, ExpectedSignal, Shape
 from dbc_proof.formulas import CounterExample, Settings
-from dbc_proof.quantities import Divisor, Presence
 
 _DEVICES = {1: "KOSMIK", 2: "KOLIBRI", 3: "JIVEPro", 4: "KONTROL-X", 5: "UHV"}
 _CAUSES = {
