@@ -17,7 +17,8 @@ import pytest
 import specification
 from cantools.database.can import Database, Signal
 from dbc_bench import check_comments
-from packer_oracle import CAN_STATES, GATEWAY_STATES, LAYOUTS, LINKS, get, pascal, put
+from packer_oracle import get, pascal, put
+from specification.quantities import CAN_STATES, GATEWAY_STATES, LAYOUTS, LINKS
 
 FILES = sorted((Path(__file__).parents[2] / "dbc").glob("*.dbc"))
 SHIPPED = next(file for file in FILES if file.stem == "kontronik_esc")

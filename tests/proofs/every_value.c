@@ -1,15 +1,16 @@
-/* Sends every raw value of every field of the wire through the core, and compares each signal of
-   the CAN frames with exact rational arithmetic.
+/* Sends every raw value of every field of the wire through the core, and compares the CAN frames
+   with frames that are made by exact rational arithmetic.
 
-   every_value fields         every value of each field with up to 16 bits, and 2^20 values of the
-                              others, in frames through the whole core
+   every_value fields         every value of each field with up to 16 bits, and many values of the
+                              others, in frames through the whole core; then expired data, a change
+                              of the layout, and quiet mode
    every_value cells          every battery voltage with every number of cells, through pack()
    every_value power          every battery voltage with every battery current, through pack()
    every_value speed          every electrical speed, through pack()
 
-   sheet.h has the rows of the sheet and of the DBC, written by sheet.py. core.c and tables.c are
-   the export of the shipped DBC. Prints the number of values and of compared signals. Exits with 1
-   at the first difference. */
+   expected.h has the fields of the specification and the signals of the DBC, written by
+   every_value.py. core.c and tables.c are the export of this DBC. Prints the number of values and
+   of compared frames. Exits with 1 at the first difference. */
 #include <inttypes.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -17,23 +18,40 @@
 #include "core.c"
 #include "tables.h"
 
+enum { LARGEST_WORDS = 8, ANY = -1 };
+enum { LIVE, INFO, LAST_INFO };            /* When a value is available. */
+enum { FREE, POLES, OUTPUT, CELLS };   /* The setting that divides a value. */
+
 struct field { const char *name; int offset, size, is_signed, is_info; };
-struct expected {
+/* Neighbouring bits of a number in a frame. They do not cross a border of 64 bits. */
+struct run { int shift, width, at; };
+struct named { int64_t number, raw; };
+struct signal {
+    const char *name;
+    int message, page; /* page: index in `pages`, or ANY */
+    int esc, presence, field, shift;
+    int64_t mask; /* 0: the whole field */
+    int is_power, divisor;
+    uint64_t not_on;
+    int64_t factor, offset, by; /* raw value = (x * factor + offset) / by, rounded once */
+    int64_t low, high, error, not_available;
+    int first_code, codes, first_name, names, first_run, runs, length;
+};
+struct page { int64_t number; uint64_t constant[LARGEST_WORDS], compared[LARGEST_WORDS]; };
+struct message {
     const char *name;
     uint32_t id;
-    int start, length, is_signed;
-    int64_t factor, factor_by, offset, offset_by; /* as fractions */
-    int64_t low, high, error, not_available;      /* raw values */
-    int field, shift, mask, rule;
-    int64_t unit, unit_by; /* one step of the field, as a fraction */
-    int first_name, names, is_bec_current;
+    int length, first_page, pages, is_last;
+    int multiplexer, multiplexers, alive, alives; /* runs */
+    int alive_values, crc_bits, crc_at;
+    uint32_t polynomial, start, final_xor;
+    int id_bytes, is_id_last;
+    uint32_t data_ids[16];
 };
-struct named { int number; int64_t raw; };
-enum { FREE, POLES, OUTPUT, CELLS, POWER, TABLE };
-#include "sheet.h"
+#include "expected.h"
 
-enum { FIELDS = sizeof fields / sizeof *fields, SIGNALS = sizeof expected / sizeof *expected };
-enum { IDS = 0x800, SPEED = 0, VOLTAGE = 1, CURRENT = 2, DEVICE = 16, CELL_COUNT = 19 };
+enum { FIELDS = sizeof fields / sizeof *fields, SIGNALS = sizeof signals / sizeof *signals };
+enum { PAGES = sizeof pages / sizeof *pages, MESSAGES = sizeof messages / sizeof *messages };
 typedef __int128 wide;
 
 /* A kind of ESC and its settings. */
@@ -44,97 +62,188 @@ struct scene {
 };
 static const struct scene scenes[] = {
     {1, 1, 2 << 10 | 80, {.poles = 7, .gear_numerator = 41, .gear_denominator = 12}},
-    {0, 1, JIVE_PRO << 10 | 120, {.poles = 1, .gear_numerator = 1, .gear_denominator = 3,
-                                  .cells = 14}},
+    {0, 1, 3 << 10 | 120, {.poles = 1, .gear_numerator = 1, .gear_denominator = 3, .cells = 14}},
     {1, 0, 0, {.poles = 100, .gear_numerator = 1048575, .gear_denominator = 1048574}},
 };
+enum { SCENES = sizeof scenes / sizeof *scenes };
 
-static int64_t value[FIELDS];
-static int has_live, has_info; /* the ESC has sent such a frame, and it is fresh */
-static int had_info; /* the device is known */
-static const struct scene *scene;
-static uint64_t seen[IDS]; /* bits of the newest frame with this id */
+static struct esc {
+    int64_t value[FIELDS];
+    int has_live, has_info; /* the ESC has sent such a frame, and it is fresh */
+    int had_info;           /* the device is known */
+    int is_v4;
+    const struct scene *scene;
+} escs[KCG_ESCS];
+static uint64_t right[PAGES][LARGEST_WORDS]; /* the expected frames, without counter and CRC */
+static int64_t sent_frames[MESSAGES];        /* since the start */
 static uint64_t values, compared;
 static kcg *core;
-static uint64_t memory[KCG_MEMORY];
+static uint64_t memory[(KCG_MEMORY + 7) / 8];
+static int64_t now;
 
-/* --- the expected raw value ------------------------------------------------------------------- */
+/* --- the expected frames ---------------------------------------------------------------------- */
 
 static wide floor_of(wide a, wide b)
 {
     return a / b - (a % b != 0 && (a < 0) != (b < 0));
 }
 
-static int64_t all_ones(int length)
+static int64_t expected_raw(const struct signal *s)
 {
-    return (int64_t)((UINT64_C(1) << length) - 1);
-}
-
-static int64_t expected_raw(const struct expected *s)
-{
-    const struct field *f = &fields[s->field];
-    int64_t mask = all_ones(s->length), cells, x = value[s->field];
-    wide steps, over = 1, by = 1;
-    if (f->is_info ? !has_info : !has_live)
-        return s->not_available & mask;
+    const struct esc *e = &escs[s->esc];
+    const kcg_settings *settings = &e->scene->settings;
+    wide x = e->value[s->field], over = 1, by = 1;
+    int is_there = s->presence == LIVE ? e->has_live : s->presence == INFO ? e->has_info
+                                                                            : e->had_info;
+    if (!is_there)
+        return s->not_available;
     if (s->mask)
-        x = x >> s->shift & s->mask;
-    /* A JIVEPro does not supply it. While there is no fresh information, 0 may mean this. */
-    if (s->is_bec_current && ((had_info && value[DEVICE] >> 10 == JIVE_PRO) || (!has_info && !x)))
-        return s->not_available & mask;
-    steps = x;
-    if (s->rule == TABLE) {
+        x = (int64_t)x >> s->shift & s->mask;
+    /* The device does not supply it. While there is no fresh information, 0 may mean this. */
+    if (s->not_on && ((e->had_info && s->not_on >> (e->value[DEVICE] >> 10) & 1) ||
+                      (!e->has_info && !x)))
+        return s->not_available;
+    if (s->names) {
         for (int k = s->first_name; k < s->first_name + s->names; k++)
             if (named[k].number == x)
-                return named[k].raw & mask;
-        return s->error & mask;
+                return named[k].raw;
+        return s->error;
     }
-    if (s->rule == POWER)
-        steps *= value[CURRENT];
-    if (s->rule == POLES || s->rule == OUTPUT)
-        by = scene->settings.poles;
-    if (s->rule == OUTPUT) {
-        by *= scene->settings.gear_numerator;
-        over = scene->settings.gear_denominator;
+    if (s->is_power)
+        x *= e->value[CURRENT];
+    if (s->divisor == POLES || s->divisor == OUTPUT)
+        by = settings->poles;
+    if (s->divisor == OUTPUT) {
+        by *= settings->gear_numerator;
+        over = settings->gear_denominator;
     }
-    if (s->rule == CELLS) {
-        cells = scene->settings.cells;
-        if (!cells && has_info)
-            cells = value[CELL_COUNT];
-        if (!cells)
-            return s->not_available & mask;
-        by = cells;
-    }
-    /* (value - offset) / factor + 1/2, rounded down */
-    wide number = steps * s->unit * over * s->offset_by - (wide)s->offset * s->unit_by * by;
-    wide divisor = (wide)s->unit_by * by * s->offset_by;
-    number *= s->factor_by;
-    divisor *= s->factor;
-    wide raw = floor_of(2 * number + divisor, 2 * divisor);
+    if (s->divisor == CELLS)
+        by = settings->cells ? settings->cells : e->has_info ? e->value[CELL_COUNT] : 0;
+    if (!by)
+        return s->not_available;
+    wide divisor = s->by * by;
+    wide raw = floor_of(2 * (x * over * s->factor + s->offset * by) + divisor, 2 * divisor);
     if (raw < s->low || raw > s->high)
-        raw = s->error;
-    return (int64_t)raw & mask;
+        return s->error;
+    for (int k = s->first_code; k < s->first_code + s->codes; k++)
+        if (codes[k] == raw)
+            return s->error;
+    return (int64_t)raw;
 }
 
-static void compare(const struct expected *s, uint64_t bits, int64_t right)
+static void put_number(uint64_t *frame, int64_t number, int first_run, int count)
 {
-    int64_t raw = (int64_t)(bits >> s->start) & all_ones(s->length);
-    compared++;
-    if (raw == right)
-        return;
-    printf("%s: raw value %" PRId64 " instead of %" PRId64 "\n", s->name, raw, right);
-    for (int k = 0; k < FIELDS; k++)
-        if (value[k])
-            printf("  %s = %" PRId64 "\n", fields[k].name, value[k]);
-    printf("  poles %" PRIu32 ", gear %" PRIu32 ":%" PRIu32 ", cells %d, live %d, info %d\n",
-           scene->settings.poles, scene->settings.gear_numerator,
-           scene->settings.gear_denominator, scene->settings.cells, has_live, has_info);
+    for (const struct run *r = runs + first_run; r < runs + first_run + count; r++) {
+        uint64_t ones = ~UINT64_C(0) >> (64 - r->width);
+        frame[r->at / 64] &= ~(ones << r->at % 64);
+        frame[r->at / 64] |= ((uint64_t)number >> r->shift & ones) << r->at % 64;
+    }
+}
+
+static uint64_t number_in(const uint64_t *frame, int first_run, int count)
+{
+    uint64_t number = 0;
+    for (const struct run *r = runs + first_run; r < runs + first_run + count; r++)
+        number |= (frame[r->at / 64] >> r->at % 64 & ~UINT64_C(0) >> (64 - r->width)) << r->shift;
+    return number;
+}
+
+/* Returns 1 if the expected value can depend on a field of an ESC. */
+static int depends(const struct signal *s, int esc, int field)
+{
+    return s->esc == esc &&
+           (s->field == field || (s->is_power && field == CURRENT) ||
+            (s->divisor == CELLS && field == CELL_COUNT) || (s->not_on && field == DEVICE));
+}
+
+/* Updates the expected frames after a field of an ESC has changed, or ANY. */
+static void expect(int esc, int field)
+{
+    for (const struct signal *s = signals; s < signals + SIGNALS; s++) {
+        const struct message *m = &messages[s->message];
+        if (field != ANY && !depends(s, esc, field))
+            continue;
+        int64_t raw = expected_raw(s);
+        for (int page = m->first_page; page < m->first_page + m->pages; page++)
+            if (s->page == ANY || s->page == page)
+                put_number(right[page], raw, s->first_run, s->runs);
+    }
+}
+
+static uint32_t crc_over(uint32_t crc, const struct message *m, const uint8_t *bytes, int count)
+{
+    uint32_t top = UINT32_C(1) << (m->crc_bits - 1);
+    for (int k = 0; k < count; k++) {
+        crc ^= (uint32_t)bytes[k] << (m->crc_bits - 8);
+        for (int bit = 0; bit < 8; bit++)
+            crc = crc & top ? crc << 1 ^ m->polynomial : crc << 1;
+        crc &= 2 * top - 1;
+    }
+    return crc;
+}
+
+static uint8_t byte_of(const uint64_t *frame, int k)
+{
+    return (uint8_t)(frame[k / 8] >> k % 8 * 8);
+}
+
+/* Writes the CRC of a frame with this alive counter. */
+static void put_crc(uint64_t *frame, const struct message *m, int64_t counter)
+{
+    uint32_t data_id = m->data_ids[counter % 16], crc = m->start;
+    uint8_t id[2] = {(uint8_t)data_id, (uint8_t)(data_id >> 8)};
+    if (!m->is_id_last)
+        crc = crc_over(crc, m, id, m->id_bytes);
+    for (int k = 0; k < m->length; k++) {
+        uint8_t byte = byte_of(frame, k);
+        if (k < m->crc_at || k >= m->crc_at + m->crc_bits / 8)
+            crc = crc_over(crc, m, &byte, 1);
+    }
+    if (m->is_id_last)
+        crc = crc_over(crc, m, id, m->id_bytes);
+    crc ^= m->final_xor;
+    for (int k = 0; k < m->crc_bits / 8; k++) {
+        int at = 8 * (m->crc_at + k);
+        frame[at / 64] &= ~(UINT64_C(255) << at % 64);
+        frame[at / 64] |= (uint64_t)(crc >> 8 * k & 255) << at % 64;
+    }
+}
+
+static void fail(const struct message *m, const char *what)
+{
+    printf("%s: %s\n", m->name, what);
+    for (int e = 0; e < KCG_ESCS; e++) {
+        const kcg_settings *settings = &escs[e].scene->settings;
+        printf("  ESC %d: poles %" PRIu32 ", gear %" PRIu32 ":%" PRIu32 ", cells %d, live %d, "
+               "info %d\n", e, settings->poles, settings->gear_numerator,
+               settings->gear_denominator, settings->cells, escs[e].has_live, escs[e].has_info);
+        for (int k = 0; k < FIELDS; k++)
+            printf("    %s = %" PRId64 "\n", fields[k].name, escs[e].value[k]);
+    }
     exit(1);
+}
+
+/* Compares the bits of a frame that the specification covers. */
+static void compare(const struct message *m, int page, const uint64_t *got, const uint64_t *want)
+{
+    int words = (m->length + 7) / 8, differs = 0;
+    for (int k = 0; k < words; k++)
+        differs |= got[k] != want[k];
+    compared++;
+    if (!differs)
+        return;
+    for (const struct signal *s = signals; s < signals + SIGNALS; s++) {
+        uint64_t raw = number_in(got, s->first_run, s->runs);
+        uint64_t wanted = number_in(want, s->first_run, s->runs);
+        if (&messages[s->message] == m && (s->page == ANY || s->page == page) && raw != wanted)
+            printf("%s: raw value %#" PRIx64 " instead of %#" PRIx64 "\n", s->name, raw, wanted);
+    }
+    fail(m, "another frame is expected");
 }
 
 /* --- frames through the whole core ------------------------------------------------------------ */
 
-static uint32_t crc_of(const uint8_t *p, int size)
+static uint32_t crc_32(const uint8_t *p, int size)
 {
     static uint32_t table[256];
     uint32_t crc = 0xFFFFFFFFu;
@@ -156,72 +265,88 @@ static void put(uint8_t *to, int64_t x, int size)
         to[k] = (uint8_t)((uint64_t)x >> 8 * k);
 }
 
-static int64_t now;
-
-static void receive(int is_info)
+static void receive(int esc, int is_info)
 {
+    struct esc *e = &escs[esc];
     uint8_t frame[44] = {'K', 'O', 'D', is_info ? 'I' : 'L'};
-    int crc_at = is_info ? (scene->is_v4 ? 40 : 37) : (scene->is_v4 ? 36 : 34);
+    int crc_at = is_info ? (e->is_v4 ? 40 : 37) : (e->is_v4 ? 36 : 34);
     for (int k = 0; k < FIELDS; k++)
         if (fields[k].is_info == is_info)
-            put(frame + fields[k].offset, value[k], fields[k].size);
-    put(frame + crc_at, crc_of(frame, crc_at / 4 * 4), 4);
-    kcg_receive(core, 0, frame, (size_t)crc_at + 4, now, now - 5000000);
-    *(is_info ? &has_info : &has_live) = 1;
-    had_info |= is_info;
+            put(frame + fields[k].offset, e->value[k], fields[k].size);
+    put(frame + crc_at, crc_32(frame, crc_at / 4 * 4), 4);
+    kcg_receive(core, (uint32_t)esc, frame, (size_t)crc_at + 4, now, now - 5000000);
+    *(is_info ? &e->has_info : &e->has_live) = 1;
+    e->had_info |= is_info;
 }
 
-/* Returns 1 if the expected value can depend on a field. */
-static int depends(const struct expected *s, int field)
+/* Takes all frames that are due, and compares each. Returns their number. */
+static uint32_t take(void)
 {
-    return s->field == field || (s->rule == POWER && field == CURRENT) ||
-           (s->rule == CELLS && field == CELL_COUNT) || (s->is_bec_current && field == DEVICE);
-}
-
-/* Takes the frames of all messages, and compares all signals. Since the last call, only this field
-   has changed, or ANY. */
-enum { ANY = -1 };
-static void take(int changed)
-{
-    static int64_t right[SIGNALS];
     kcg_frame frames[KCG_MESSAGES];
     uint32_t count, all = 0;
-    for (int k = 0; k < SIGNALS; k++)
-        seen[expected[k].id] = UINT64_C(0xA5A5A5A5A5A5A5A5);
     kcg_repeat(core, now);
     kcg_advance(core, now);
     while ((count = kcg_take(core, now, frames, KCG_MESSAGES)) > 0) {
-        for (uint32_t k = 0; k < count; k++) {
-            uint64_t bits = 0;
-            for (int byte = 7; byte >= 0; byte--)
-                bits = bits << 8 | frames[k].data[byte];
-            seen[frames[k].id] = bits;
+        for (const kcg_frame *f = frames; f < frames + count; f++) {
+            uint64_t got[LARGEST_WORDS] = {0}, want[LARGEST_WORDS];
+            int number = 0, page;
+            while (number < MESSAGES && messages[number].id != f->id)
+                number++;
+            if (number == MESSAGES) {
+                printf("a frame with id %" PRIx32 "h\n", f->id);
+                exit(1);
+            }
+            const struct message *m = &messages[number];
+            for (int k = 0; k < KCG_DATA; k++)
+                got[k / 8] |= (uint64_t)f->data[k] << k % 8 * 8;
+            page = m->first_page;
+            int64_t multiplexer = (int64_t)number_in(got, m->multiplexer, m->multiplexers);
+            while (m->multiplexers && pages[page].number != multiplexer)
+                if (++page == m->first_page + m->pages)
+                    fail(m, "has an unknown multiplexer value");
+            if (f->length != m->length)
+                fail(m, "has another length");
+            for (int k = 0; k < LARGEST_WORDS; k++) /* other bits are part of the CRC, too */
+                want[k] = (right[page][k] & pages[page].compared[k]) |
+                          (got[k] & ~pages[page].compared[k]);
+            int64_t counter = sent_frames[number]++ % m->alive_values;
+            put_number(want, counter, m->alive, m->alives);
+            if (m->crc_bits)
+                put_crc(want, m, counter);
+            compare(m, page, got, want);
         }
         all += count;
         kcg_sent(core, now, count);
     }
-    if (all != KCG_MESSAGES) {
-        printf("%u frames instead of %d\n", all, KCG_MESSAGES);
-        exit(1);
-    }
-    for (int k = 0; k < SIGNALS; k++)
-        if (changed == ANY || depends(&expected[k], changed))
-            right[k] = expected_raw(&expected[k]);
-    for (int k = 0; k < SIGNALS; k++)
-        compare(&expected[k], seen[expected[k].id], right[k]);
+    return all;
 }
 
-static void send_values(int changed)
+/* Takes each page of each message once. */
+static void take_all(void)
 {
-    now += INT64_C(1000000000);
-    if (scene->has_info)
-        receive(1);
-    receive(0);
-    take(changed);
+    for (int round = 0; round < ROUNDS; round++) {
+        now += INT64_C(1000000000);
+        uint32_t count = take();
+        if (count != KCG_MESSAGES) {
+            printf("%" PRIu32 " frames instead of %d\n", count, KCG_MESSAGES);
+            exit(1);
+        }
+    }
+}
+
+static void send_values(int esc, int changed)
+{
+    for (int e = 0; e < KCG_ESCS; e++) {
+        if (escs[e].scene->has_info)
+            receive(e, 1);
+        receive(e, 0);
+    }
+    expect(esc, changed);
+    take_all();
     values++;
 }
 
-/* 2^20 values of 32 bits: the smallest, the greatest, those around the limit of 24 bits, and others
+/* Values of 32 bits: the smallest, the greatest, those around the limit of 24 bits, and others
    spread over all. */
 static int64_t some_value(uint32_t k)
 {
@@ -234,62 +359,128 @@ static int64_t some_value(uint32_t k)
     }
 }
 
-static void start(const struct scene *s)
+static void start(int number)
 {
-    scene = s;
+    kcg_settings settings[KCG_ESCS];
     now = INT64_C(1) << 50;
-    has_live = has_info = had_info = 0;
-    kcg_settings settings = s->settings;
-    settings.timeout = INT64_C(20000000000);
-    settings.crc_errors = 5;
-    core = kcg_init(memory, &kcg_tables, &settings, now);
-    for (int k = 0; k < FIELDS; k++)
-        value[k] = fields[k].is_signed ? -11 - k : 17 + k;
-    value[DEVICE] = s->device_and_variant;
-    now += INT64_C(2000000000);
-    take(ANY); /* without any data */
+    memset(sent_frames, 0, sizeof sent_frames);
+    for (int page = 0; page < PAGES; page++)
+        memcpy(right[page], pages[page].constant, sizeof right[page]);
+    for (int e = 0; e < KCG_ESCS; e++) {
+        struct esc *esc = &escs[e];
+        memset(esc, 0, sizeof *esc);
+        esc->scene = &scenes[(number + e) % SCENES];
+        esc->is_v4 = esc->scene->is_v4;
+        settings[e] = esc->scene->settings;
+        settings[e].timeout = INT64_C(20000000000);
+        settings[e].crc_errors = 5;
+        for (int k = 0; k < FIELDS; k++)
+            esc->value[k] = (fields[k].is_signed ? -11 : 17) * (1 + e) + k;
+        esc->value[DEVICE] = esc->scene->device_and_variant;
+    }
+    core = kcg_init(memory, &kcg_tables, settings, now);
+    expect(0, ANY);
+    take_all(); /* without any data */
 }
 
-static void every_field(const struct scene *s)
+static int is_used(int esc, int field)
 {
-    start(s);
+    for (const struct signal *s = signals; s < signals + SIGNALS; s++)
+        if (depends(s, esc, field))
+            return 1;
+    return 0;
+}
+
+static void every_field_of(int esc, int number)
+{
+    /* The scenes after the first one need fewer values of 32 bits, and without IS_LONG of 16. */
+    uint32_t large = number || !IS_LONG ? 16 : 1, medium = number && !IS_LONG ? 16 : 1;
+    struct esc *e = &escs[esc];
     for (int k = 0; k < FIELDS; k++) {
         const struct field *f = &fields[k];
-        int64_t base = value[k], first = f->is_signed ? -(1 << (f->size * 8 - 1)) : 0;
-        if (f->is_info && !s->has_info)
+        int64_t base = e->value[k], first = f->is_signed ? -(1 << (f->size * 8 - 1)) : 0;
+        if ((f->is_info && !e->scene->has_info) || !is_used(esc, k))
             continue;
         for (uint32_t n = 0; n < (f->size == 4 ? 1u << 20 : 1u << f->size * 8); n++) {
-            if (f->size == 4 && s != scenes && n % 16)
-                continue; /* 2^16 values are enough for the other scenes */
-            value[k] = f->size == 4 ? some_value(n) : first + n;
-            send_values(n ? k : ANY);
+            if (n % (f->size == 4 ? large : f->size == 2 ? medium : 1))
+                continue;
+            e->value[k] = f->size == 4 ? some_value(n) : first + n;
+            send_values(esc, n ? k : ANY);
         }
-        value[k] = base;
+        e->value[k] = base;
+        send_values(esc, ANY);
     }
-    send_values(ANY);
-    now += INT64_C(10000000001) + 5000000; /* the information has expired */
-    has_info = 0;
-    take(ANY);
-    now += INT64_C(10000000000); /* live data have expired, too */
-    has_live = 0;
-    take(ANY);
+}
+
+static void expire_data(int is_live)
+{
+    for (int e = 0; e < KCG_ESCS; e++)
+        *(is_live ? &escs[e].has_live : &escs[e].has_info) = 0;
+    expect(0, ANY);
+    take_all();
+}
+
+/* A frame in the other layout is sent by another device: what was known of the old one is gone. */
+static void change_layout(void)
+{
+    for (int e = 0; e < KCG_ESCS; e++) {
+        escs[e].is_v4 = !escs[e].is_v4;
+        receive(e, 0);
+        escs[e].has_info = escs[e].had_info = 0;
+    }
+    expect(0, ANY);
+    take_all();
+    send_values(0, ANY);
+}
+
+/* Quiet mode begins after QUIET_AFTER without live data. Only messages with values of the gateway
+   are sent then, for the last time. */
+static void become_quiet(void)
+{
+    uint32_t last = 0, count;
+    for (const struct message *m = messages; m < messages + MESSAGES; m++)
+        last += m->is_last ? (uint32_t)m->pages : 0;
+    now += QUIET_AFTER;
+    count = take();
+    for (int k = 0; k < 100; k++, now += INT64_C(1000000000))
+        count += take();
+    if (count != last) {
+        printf("%" PRIu32 " frames in quiet mode instead of %" PRIu32 "\n", count, last);
+        exit(1);
+    }
+    send_values(0, ANY);
+}
+
+static void every_field(int number)
+{
+    start(number);
+    for (int e = 0; e < KCG_ESCS; e++)
+        every_field_of(e, number);
+    send_values(0, ANY);
+    change_layout();
+    now += INT64_C(10000000001) + 5000000;
+    expire_data(0);
+    now += INT64_C(10000000000);
+    expire_data(1);
+    if (QUIET_AFTER)
+        become_quiet();
 }
 
 /* --- values through pack() -------------------------------------------------------------------- */
 
 enum { CHOSEN = 3 };
-/* Signals to compare, and their messages. */
-static struct { const struct expected *signal; const kcg_message *message; } chosen[CHOSEN + 1];
+/* The messages with signals that depend on the fields, and these signals. */
+static struct { const struct signal *signal; const kcg_message *message; } chosen[CHOSEN + 1];
 
 static void choose(const char *const *names)
 {
     int count = 0;
     for (; *names; names++, count++) {
-        const struct expected *s = expected;
+        const struct signal *s = signals;
         while (strcmp(s->name, *names))
             s++;
         const kcg_message *m = kcg_tables.message;
-        while (m->id != s->id)
+        while (m->id != messages[s->message].id)
             m++;
         chosen[count].signal = s;
         chosen[count].message = m;
@@ -301,13 +492,17 @@ static void choose(const char *const *names)
 static void pack_and_compare(void)
 {
     const kcg_message *packed = NULL;
-    uint64_t bits = 0;
+    uint64_t bits[LARGEST_WORDS] = {0};
     for (int k = 0; chosen[k].signal; k++) {
+        const struct signal *s = chosen[k].signal;
         if (chosen[k].message != packed) {
             packed = chosen[k].message;
-            pack(core, packed, 0, now, 0, &bits);
+            pack(core, packed, 0, now, 0, bits);
         }
-        compare(chosen[k].signal, bits, expected_raw(chosen[k].signal));
+        uint64_t raw = (uint64_t)expected_raw(s) & ~UINT64_C(0) >> (64 - s->length);
+        if (number_in(bits, s->first_run, s->runs) != raw)
+            fail(&messages[s->message], s->name);
+        compared++;
     }
     values++;
 }
@@ -318,15 +513,16 @@ static void accept_live(void)
     f.layout = 1;
     for (int k = 0; k < FIELDS; k++)
         if (!fields[k].is_info)
-            put(f.body + fields[k].offset - 4, value[k], fields[k].size);
+            put(f.body + fields[k].offset - 4, escs->value[k], fields[k].size);
     accept(core->esc, &f, now, now);
 }
 
 static void every_pair(const char *const *names, int field, int64_t first, int64_t last)
 {
-    start(&scenes[0]);
+    int64_t *value = escs->value;
+    start(0);
     choose(names);
-    send_values(ANY);
+    send_values(0, ANY);
     for (value[VOLTAGE] = 0; value[VOLTAGE] < 1 << 16; value[VOLTAGE]++)
         for (value[field] = first; value[field] <= last; value[field]++) {
             if (field == CELL_COUNT)
@@ -339,9 +535,10 @@ static void every_pair(const char *const *names, int field, int64_t first, int64
 static void every_speed(void)
 {
     static const char *const names[] = {"ElectricalSpeed", "MotorSpeed", "OutputSpeed", NULL};
-    start(&scenes[0]);
+    int64_t *value = escs->value;
+    start(0);
     choose(names);
-    send_values(ANY);
+    send_values(0, ANY);
     for (value[SPEED] = 0; value[SPEED] <= UINT32_MAX; value[SPEED]++) {
         put(core->esc->live, value[SPEED], 4);
         pack_and_compare();
@@ -354,8 +551,8 @@ int main(int count, char **words)
     static const char *const of_power[] = {"BatteryPower", NULL};
     const char *part = count > 1 ? words[1] : "";
     if (!strcmp(part, "fields"))
-        for (size_t k = 0; k < sizeof scenes / sizeof *scenes; k++)
-            every_field(&scenes[k]);
+        for (int number = 0; number < SCENES; number++)
+            every_field(number);
     else if (!strcmp(part, "cells"))
         every_pair(of_cells, CELL_COUNT, 0, 255);
     else if (!strcmp(part, "power"))
@@ -364,6 +561,6 @@ int main(int count, char **words)
         every_speed();
     else
         return 2;
-    printf("%" PRIu64 " values, %" PRIu64 " signals\n", values, compared);
+    printf("%" PRIu64 " values, %" PRIu64 " frames\n", values, compared);
     return 0;
 }

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from every_value import compare_values
 from scaled_frames import WHOLE_PREFIX
+from test_dbc_proof import ONE_ESC
+from test_every_value import configuration
 from test_small_scope import SYMBOLS_IN_C, prove_in_c
 
 
@@ -16,10 +18,10 @@ def test_all_short_streams_give_the_frames_of_brute_force_with_the_whole_prefix(
     prove_in_c(tmp_path, WHOLE_PREFIX, SYMBOLS_IN_C)
 
 
-def test_every_electrical_speed_is_packed_as_the_sheet_and_the_dbc_demand(tmp_path: Path) -> None:
-    assert compare_values(tmp_path, "speed").values == (1 << 32) + 1
+def test_every_electrical_speed_is_packed_as_the_dbc_demands(tmp_path: Path) -> None:
+    assert compare_values(configuration(tmp_path, ONE_ESC), "speed").values == (1 << 32) + 1
 
 
-def test_every_power_is_packed_as_the_sheet_and_the_dbc_demand(tmp_path: Path) -> None:
+def test_every_power_is_packed_as_the_dbc_demands(tmp_path: Path) -> None:
     """Every battery voltage with every battery current."""
-    assert compare_values(tmp_path, "power").values == (1 << 32) + 1
+    assert compare_values(configuration(tmp_path, ONE_ESC), "power").values == (1 << 32) + 1

@@ -1,8 +1,8 @@
 """Computes raw values of signals independently, and makes random DBC layouts and telemetry.
 
-Nothing here uses the package's tables of fields, units or positions. They are typed again from the
-telemetry sheet, here and in tests/specification, and bits are counted one by one. The package is
-used only to make telemetry objects from encoded frames.
+Nothing here uses the package's tables of fields, units or positions. The values and their rules
+are those of tests/specification, and bits are counted one by one. The package is used only to make
+telemetry objects from encoded frames.
 """
 
 import math
@@ -12,11 +12,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any
 
 import cantools.database
 import specification
 from cantools.database.can import Database
+from specification.quantities import (
+    PRODUCT,
+    QUANTITIES,
+    Divisor,
+    Quantity,
+)
+from specification.rule import Described, Rule
 
 from kontronik_can_gw.core.esc_stream import EscStream
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
@@ -66,220 +72,106 @@ def get(
     return raw - (1 << length) if is_negative else raw
 
 
-# --- values to publish, typed from the sheet
+# --- values to publish
 
 Reader = Callable[[EscTelemetry, GatewayStatus, int], "int | Fraction | None"]
 
 
 @dataclass(frozen=True)
 class Known:
-    """The oracle's own description of a source.
-
-    It has the unit, a function that reads it in that unit (None: not available), and the names of
-    its numbers.
-    """
+    """A value: its unit, a function that reads it (None: not available), and its numbers' names."""
 
     unit: str
     read: Reader
-    names: Mapping[int, str] = field(default_factory=dict)
-    rolls: bool = False
-    gateway: bool = False
+    names: Mapping[int, str]
+    rolls: bool
+    gateway: bool
+    quantity: Quantity
 
 
 STATES = specification.OPERATING_STATES
 DEVICES = specification.DEVICES
-LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
-LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
-GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay", "Quiet")))
-CAN_STATES = dict(
-    enumerate(("Unknown", "ErrorActive", "ErrorWarning", "ErrorPassive", "BusOff", "Down"))
-)
-
-ERROR_BITS = [
-    "undervoltage",
-    "overvoltage",
-    "overcurrent_integral_error",
-    "overcurrent_integral_warning",
-    "power_stage_overtemp_warning",
-    "power_stage_overtemp_error",
-    "bec_undervoltage",
-    "bec_overvoltage",
-    "bec_overcurrent",
-    "bec_overtemperature",
-    "switched_off_by_running_down",
-    "capacity_limit_reached",
-    "operating_error_found",
-    "operating_warning_found",
-    "selftest_error",
-    "eeprom_error",
-    "watchdog_error_tripped",
-    "programming_allowed",
-    "limit_battery_voltage_minimum",
-    "limit_current_maximum",
-    "limit_power_stage_temperature",
-    "limit_bec_temperature",
-    "limit_bec_current",
-    "limit_discharged_capacity",
-]
-TEST_BITS = [
-    "test_phase_low_side",
-    "test_phase_high_side",
-    "test_short_to_ground",
-    "test_back_emf_offset",
-    "test_current_zero_point",
-    "test_undervoltage",
-    "test_overvoltage",
-    "test_bec_undervoltage",
-    "test_bec_overvoltage",
-    "test_reverse_polarity_fuse",
-    "test_overvoltage_fuse",
-    "test_power_stage_overtemp",
-    "test_bec_overtemperature",
-    "test_motor_phase_missing",
-    "test_eeprom_empty",
-    "test_eeprom_stick_positions",
-    "test_eeprom_checksum",
-    "test_eeprom_size",
-    "test_eeprom_version",
-]
-
-JIVEPRO = 3
-
-
-def _of(part: str, reckon: Callable[[EscTelemetry, Any], "int | Fraction | None"]) -> Reader:
-    """Return a function that computes a value from ``live`` or ``info`` data, or returns None."""
-
-    def read(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> int | Fraction | None:
-        data = getattr(esc, part)
-        return None if data is None else reckon(esc, data)
-
-    return read
-
-
-def _fields(part: str, fields: Sequence[specification.Field]) -> dict[str, Known]:
-    """Return the sources of fields whose number is the value."""
-    spelled = str.maketrans({"µ": "u", "°": "deg"})
-
-    def reader(name: str, steps: int) -> Reader:
-        return _of(part, lambda _, data: Fraction(getattr(data, name), steps))
-
-    known = {}
-    for each in fields:
-        unit = each.unit.translate(spelled)
-        known[each.name] = Known(unit, reader(each.name, each.steps))
-    return known
-
-
-def _bits(part: str, word: str, names: Sequence[str]) -> dict[str, Known]:
-    def reader(bit: int) -> Reader:
-        return _of(part, lambda _, data: getattr(data, word) >> bit & 1)
-
-    return {name: Known("", reader(bit)) for bit, name in enumerate(names)}
-
-
-def _bec_current(esc: EscTelemetry, live: LiveData) -> Fraction | None:
-    known = esc.info or esc.last_info
-    is_jive = known is not None and known.device_and_variant >> 10 == JIVEPRO
-    if is_jive or (esc.info is None and not live.bec_current):
-        return None
-    return Fraction(live.bec_current, 1000)
-
-
-def _max_bec_current(_esc: EscTelemetry, info: InfoData) -> Fraction | None:
-    is_jive = info.device_and_variant >> 10 == JIVEPRO
-    return None if is_jive else Fraction(info.max_bec_current, 1000)
-
-
-def _counters(
-    names: str,
-    owner: Callable[[EscTelemetry, GatewayStatus], Any],
-    gateway: bool = False,
-) -> dict[str, Known]:
-    def reader(path: str) -> Reader:
-        return lambda esc, of_gateway, _: getattr(owner(esc, of_gateway), path)
-
-    found = {}
-    for pair in names.split():
-        name, _, path = pair.partition("=")
-        found[name] = Known("", reader(path or name), rolls=True, gateway=gateway)
-    return found
-
-
-def _motor_speed(esc: EscTelemetry, live: LiveData) -> Fraction:
-    return Fraction(live.electrical_speed, esc.settings.pole_pairs)
-
-
-def _output_speed(esc: EscTelemetry, live: LiveData) -> Fraction:
-    return live.electrical_speed / (esc.settings.pole_pairs * esc.settings.gear)
-
-
-def _battery_power(_esc: EscTelemetry, live: LiveData) -> Fraction:
-    return Fraction(live.battery_voltage * live.battery_current, 1000)
-
-
-def _mean_cell_voltage(esc: EscTelemetry, live: LiveData) -> Fraction | None:
-    if not esc.cells:
-        return None
-    return Fraction(live.battery_voltage, 100 * esc.cells)
-
-
-def _data_age(esc: EscTelemetry, _gateway: GatewayStatus, now: int) -> int | None:
-    if esc.live_ns is None:
-        return None
-    return max(0, now - esc.live_ns) // 10**6
-
-
-def _frame_rate(esc: EscTelemetry, _gateway: GatewayStatus, _now: int) -> Fraction | None:
-    if esc.frame_rate is None:
-        return None
-    return Fraction(esc.frame_rate, 10)
-
-
-def _uptime(_esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction:
-    return Fraction((now - gateway.started_ns) // 10**6, 1000)
-
-
-KNOWN: dict[str, Known] = {
-    **_fields("live", specification.LIVE_FIELDS),
-    "bec_current": Known("A", _of("live", _bec_current)),
-    "operating_state": Known("", _of("live", lambda _, v: v.operating_state), STATES),
-    "operating_state_raw": Known("", _of("live", lambda _, v: v.operating_state)),
-    **_bits("live", "operating_errors", ERROR_BITS),
-    **_bits("info", "selftest_errors", TEST_BITS),
-    **_fields("info", specification.INFO_FIELDS[2:]),
-    "max_bec_current": Known("A", _of("info", _max_bec_current)),
-    "device": Known("", _of("info", lambda _, i: i.device_and_variant >> 10), DEVICES),
-    "device_raw": Known("", _of("info", lambda _, i: i.device_and_variant >> 10)),
-    "variant": Known("", _of("info", lambda _, i: i.device_and_variant & 1023)),
-    "firmware_main": Known("", _of("info", lambda _, i: i.firmware_word >> 8)),
-    "firmware_sub": Known("", _of("info", lambda _, i: i.firmware_word & 255)),
-    "motor_speed": Known("1/min", _of("live", _motor_speed)),
-    "output_speed": Known("1/min", _of("live", _output_speed)),
-    "battery_power": Known("W", _of("live", _battery_power)),
-    "mean_cell_voltage": Known("V", _of("live", _mean_cell_voltage)),
-    "energy_used": Known("Wh", lambda e, _g, _n: Fraction(e.energy_mw_ns // 10**9, 3600 * 1000)),
-    "motor_run_time": Known("s", lambda e, _g, _n: Fraction(e.run_time_ns, 10**9)),
-    "link_state": Known("", lambda e, _g, _n: int(e.link), LINKS),
-    "layout": Known("", lambda e, _g, _n: e.layout, LAYOUTS),
-    "data_age": Known("ms", _data_age),
-    "frame_rate": Known("Hz", _frame_rate),
-    **_counters("losses suspect_frames", lambda e, _: e),
-    **_counters(
-        "crc_errors dropped_bytes live_frames=live info_frames=info received_bytes=bytes",
-        lambda e, _: e.counters,
-    ),
-    "gateway_state": Known("", lambda _e, g, _n: int(g.state), GATEWAY_STATES, gateway=True),
-    "can_state": Known("", lambda _e, g, _n: int(g.can_state), CAN_STATES, gateway=True),
-    "esc_count": Known("", lambda _e, g, _n: g.esc_count, gateway=True),
-    "escs_ok": Known("", lambda _e, g, _n: g.escs_ok, gateway=True),
-    "uptime": Known("s", _uptime, gateway=True),
-    **_counters(
-        "sent_frames replaced_frames send_failures received_frames bus_off_count dropped_frames "
-        "id_conflicts can_restarts",
-        lambda _, gateway: gateway,
-        gateway=True,
-    ),
+ERROR_BITS = [bit.name for bit in specification.OPERATING_BITS]
+TEST_BITS = [bit.name for bit in specification.SELFTEST_BITS]
+_NAMES = {
+    **{("live", field.offset): field.name for field in specification.LIVE_FIELDS},
+    **{("info", field.offset): field.name for field in specification.INFO_FIELDS},
 }
+"""Name of a field by the kind and the offset of its frame."""
+_STEPS: dict[str, Callable[[EscTelemetry, GatewayStatus, int], int | None]] = {
+    "energy_used": lambda esc, _g, _n: esc.energy_mw_ns // 10**9,
+    "motor_run_time": lambda esc, _g, _n: esc.run_time_ns,
+    "link_state": lambda esc, _g, _n: int(esc.link),
+    "layout": lambda esc, _g, _n: esc.layout,
+    "data_age": lambda esc, _, now: (
+        None if esc.live_ns is None else max(0, now - esc.live_ns) // 10**6
+    ),
+    "frame_rate": lambda esc, _g, _n: esc.frame_rate,
+    "uptime": lambda _, gateway, now: (now - gateway.started_ns) // 10**6,
+    "gateway_state": lambda _e, gateway, _n: int(gateway.state),
+    "can_state": lambda _e, gateway, _n: int(gateway.can_state),
+}
+"""Number of steps of the values that are in no frame."""
+_OF_COUNTERS = {
+    "crc_errors": "crc_errors",
+    "dropped_bytes": "dropped_bytes",
+    "live_frames": "live",
+    "info_frames": "info",
+    "received_bytes": "bytes",
+}
+
+
+def _steps(
+    name: str, quantity: Quantity, esc: EscTelemetry, gateway: GatewayStatus, now: int
+) -> int | None:
+    read = quantity.read
+    if name in _STEPS:
+        return _STEPS[name](esc, gateway, now)
+    if quantity.of_gateway:
+        return int(getattr(gateway, name))
+    if name in _OF_COUNTERS:
+        return int(getattr(esc.counters, _OF_COUNTERS[name]))
+    if not read.wire and read != PRODUCT:
+        return int(getattr(esc, name))
+    data = esc.info if read.source == "info" else esc.live
+    if data is None:
+        return None
+    if read == PRODUCT:
+        return esc.live.battery_voltage * esc.live.battery_current if esc.live else None
+    number = int(getattr(data, _NAMES[read.source, read.offset]))
+    if quantity.not_on:
+        known = esc.info or esc.last_info
+        is_unknown = esc.info is None and not number
+        if is_unknown or (known and known.device_and_variant >> 10 in quantity.not_on):
+            return None
+    return number >> read.shift & read.mask if read.mask else number
+
+
+def _known(name: str, quantity: Quantity) -> Known:
+    def read(esc: EscTelemetry, gateway: GatewayStatus, now: int) -> int | Fraction | None:
+        steps = _steps(name, quantity, esc, gateway, now)
+        if steps is None or (quantity.divisor is Divisor.CELLS and not esc.cells):
+            return None
+        value = Fraction(steps, quantity.steps)
+        if quantity.divisor is Divisor.CELLS:
+            value /= esc.cells
+        if quantity.divisor in (Divisor.POLES, Divisor.OUTPUT):
+            value /= esc.settings.pole_pairs
+        if quantity.divisor is Divisor.OUTPUT:
+            value /= esc.settings.gear
+        return value
+
+    return Known(
+        unit=quantity.unit,
+        read=read,
+        names=quantity.names,
+        rolls=quantity.rolls,
+        gateway=quantity.of_gateway,
+        quantity=quantity,
+    )
+
+
+KNOWN = {name: _known(name, quantity) for name, quantity in QUANTITIES.items()}
 
 UNITS: dict[str, list[tuple[str, str, str]]] = {
     "V": [
@@ -418,39 +310,27 @@ class Sig:
         return None
 
     @property
+    def rule(self) -> Rule:
+        """The meaning of its raw values."""
+        own = self.start_value is not None
+        described = Described(
+            length=self.length,
+            signed=self.signed,
+            is_float=self.is_float,
+            factor=Fraction(self.factor),
+            offset=Fraction(self.offset),
+            limits=(Fraction(self.minimum), Fraction(self.maximum)),
+            texts=[*self.texts.items()],
+            start=self.start_value if own else 0,  # the file's default
+            has_own_start=own,
+        )
+        factor, shift = self.conversion
+        conversion = Fraction(factor), Fraction(shift)
+        return described.of_quantity(KNOWN[self.source].quantity, None, conversion)
+
+    @property
     def not_available(self) -> int:
-        listed = self.code("NotAvailable")
-        if listed is not None:
-            return listed
-        if self.start_value is not None:
-            return self.start_value
-        if self.length == 1:
-            return 0  # the file's default of GenSigStartValue, because a flag has no code
-        return self.range[0] if self.signed else self.range[1]
-
-    @property
-    def error(self) -> int:
-        listed = self.code("Error")
-        return self.not_available if listed is None else listed
-
-    @property
-    def limits(self) -> tuple[int, int]:
-        """Smallest and greatest raw value that is not a code."""
-        low, high = self.range
-        factor = Fraction(self.factor)
-        offset = Fraction(self.offset)
-        least = Fraction(self.minimum)
-        most = Fraction(self.maximum)
-        if least or most:
-            ends = sorted(((least - offset) / factor, (most - offset) / factor))
-            low = max(low, math.ceil(ends[0]))
-            high = min(high, math.floor(ends[1]))
-        codes = {self.code("NotAvailable"), self.code("Error")}
-        while high in codes:
-            high -= 1
-        while low in codes:
-            low += 1
-        return low, high
+        return self.rule.not_available
 
     def physical(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> Fraction | None:
         """Return the value in the signal's unit."""
@@ -462,27 +342,8 @@ class Sig:
 
     def right(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> int:
         """Return the correct raw value: the nearest one, halves up."""
-        known = KNOWN[self.source]
-        value = self.physical(esc, gateway, now)
-        if value is None:
-            return self.not_available
-        codes = {plain(name): code for code, name in self.texts.items()}
-        by_text = {}
-        for number, text in known.names.items():
-            if plain(text) in codes:
-                by_text[number] = codes[plain(text)]
-        if by_text:
-            return by_text.get(int(value), self.error)
-        low, high = self.limits
-        if known.rolls:
-            counted = [high + 1, *(code for code in codes.values() if code >= 0)]
-            return int(value) % min(counted)
-        exact = (value - Fraction(self.offset)) / Fraction(self.factor)
-        raw = math.floor(exact + Fraction(1, 2))
-        looks_like_none = raw == self.not_available and self.length > 1
-        if low <= raw <= high and not looks_like_none:
-            return raw
-        return self.error
+        value = KNOWN[self.source].read(esc, gateway, now)
+        return self.rule.sent(None if value is None else Fraction(value))
 
     def float_is_right(
         self,

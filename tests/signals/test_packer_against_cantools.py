@@ -71,11 +71,12 @@ def check_frame(
         else:
             right = signal.right(escs[signal.esc], gateway, now)
             assert raw == right, f"{about}, not {right}"
-            known, (low, high) = KNOWN[signal.source], signal.limits
+            known = KNOWN[signal.source]
+            rule = signal.rule
             value = signal.physical(escs[signal.esc], gateway, now)
             if value is None or known.names or known.rolls:
                 continue
-            if low < raw < high and raw != signal.error:
+            if rule.is_value(raw) and raw != rule.error:
                 apart = abs(float(value) - physicals[signal.name])
                 step = abs(float(signal.factor))
                 assert apart <= step / 2 + 1e-9 * max(step, abs(float(value))), about

@@ -1,7 +1,8 @@
-"""The sheet, typed a second time by hand from the description of the wire.
+"""The vendor's protocol specification, typed a second time by hand.
 
-Imports nothing of the tested package. Offsets are written out here, while the package derives them.
-So a misplaced row in either list is found.
+Imports nothing of the tested package, and all tests use it. Offsets are written out here, while the
+package derives them. So a misplaced row in either list is found. `quantities` has the values that
+are derived from the fields, and `rule` the raw values of signals.
 """
 
 from typing import NamedTuple
@@ -20,7 +21,7 @@ class Field(NamedTuple):
     """Number of steps that make one unit."""
 
 
-# The sheet has BEC current and voltage in mA and mV. They are published in A and V.
+# The specification has BEC current and voltage in mA and mV. They are published in A and V.
 LIVE_FIELDS = [
     Field("electrical_speed", 4, "I", "1/min"),
     Field("battery_voltage", 8, "H", "V", 100),
@@ -108,6 +109,8 @@ FORM_ROWS = [
 
 DEVICES = {1: "KOSMIK", 2: "KOLIBRI", 3: "JIVEPro", 4: "KONTROL-X", 5: "UHV"}
 
+JIVEPRO = 3
+
 PEAK_CURRENT_OF = {1: "motor", 2: "motor", 3: "battery", 4: "motor"}
 
 OPERATING_STATES = {
@@ -140,59 +143,61 @@ class Bit(NamedTuple):
     """One bit of an error word."""
 
     number: int
+    name: str
+    """Name of its value."""
     words: tuple[str, ...]
     """Words that its name or meaning must contain."""
     severity: str | None = None
-    """Its class, or None if the sheet does not state it."""
+    """Its class, or None if the specification does not state it."""
 
 
 OPERATING_BITS = [
-    Bit(0, ("undervoltage", "battery")),
-    Bit(1, ("overvoltage", "battery")),
-    Bit(2, ("overcurrent", "integral", "error"), "error"),
-    Bit(3, ("overcurrent", "integral", "warning"), "warning"),
-    Bit(4, ("power_stage", "overtemp", "warning"), "warning"),
-    Bit(5, ("power_stage", "overtemp", "error"), "error"),
-    Bit(6, ("bec", "undervoltage")),
-    Bit(7, ("bec", "overvoltage")),
-    Bit(8, ("bec", "overcurrent")),
-    Bit(9, ("bec", "overtemp")),
-    Bit(10, ("switched off by running down", "speed control")),
-    Bit(11, ("capacity", "limit", "reached")),
-    Bit(12, ("summary", "operating error"), "error"),
-    Bit(13, ("summary", "operating warning"), "warning"),
-    Bit(14, ("selftest", "error"), "error"),
-    Bit(15, ("eeprom", "error"), "error"),
-    Bit(16, ("watchdog", "error", "tripped"), "error"),
-    Bit(17, ("programming", "allowed", "no alarm"), "status"),
-    Bit(18, ("preset threshold", "battery voltage", "minimum")),
-    Bit(19, ("preset threshold", "current", "maximum")),
-    Bit(20, ("preset threshold", "power stage temperature")),
-    Bit(21, ("preset threshold", "bec temperature")),
-    Bit(22, ("preset threshold", "bec current")),
-    Bit(23, ("preset threshold", "discharged capacity")),
+    Bit(0, "undervoltage", ("undervoltage", "battery")),
+    Bit(1, "overvoltage", ("overvoltage", "battery")),
+    Bit(2, "overcurrent_integral_error", ("overcurrent", "integral", "error"), "error"),
+    Bit(3, "overcurrent_integral_warning", ("overcurrent", "integral", "warning"), "warning"),
+    Bit(4, "power_stage_overtemp_warning", ("power_stage", "overtemp", "warning"), "warning"),
+    Bit(5, "power_stage_overtemp_error", ("power_stage", "overtemp", "error"), "error"),
+    Bit(6, "bec_undervoltage", ("bec", "undervoltage")),
+    Bit(7, "bec_overvoltage", ("bec", "overvoltage")),
+    Bit(8, "bec_overcurrent", ("bec", "overcurrent")),
+    Bit(9, "bec_overtemperature", ("bec", "overtemp")),
+    Bit(10, "switched_off_by_running_down", ("switched off by running down", "speed control")),
+    Bit(11, "capacity_limit_reached", ("capacity", "limit", "reached")),
+    Bit(12, "operating_error_found", ("summary", "operating error"), "error"),
+    Bit(13, "operating_warning_found", ("summary", "operating warning"), "warning"),
+    Bit(14, "selftest_error", ("selftest", "error"), "error"),
+    Bit(15, "eeprom_error", ("eeprom", "error"), "error"),
+    Bit(16, "watchdog_error_tripped", ("watchdog", "error", "tripped"), "error"),
+    Bit(17, "programming_allowed", ("programming", "allowed", "no alarm"), "status"),
+    Bit(18, "limit_battery_voltage_minimum", ("preset threshold", "battery voltage", "minimum")),
+    Bit(19, "limit_current_maximum", ("preset threshold", "current", "maximum")),
+    Bit(20, "limit_power_stage_temperature", ("preset threshold", "power stage temperature")),
+    Bit(21, "limit_bec_temperature", ("preset threshold", "bec temperature")),
+    Bit(22, "limit_bec_current", ("preset threshold", "bec current")),
+    Bit(23, "limit_discharged_capacity", ("preset threshold", "discharged capacity")),
 ]
 
 SELFTEST_BITS = [
-    Bit(0, ("motor phase", "low side", "does not switch"), "error"),
-    Bit(1, ("motor phase", "high side", "does not switch"), "error"),
-    Bit(2, ("short", "gnd", "rest level"), "error"),
-    Bit(3, ("back-emf", "offset"), "error"),
-    Bit(4, ("current", "zero point"), "error"),
-    Bit(5, ("undervoltage",), "error"),
-    Bit(6, ("overvoltage",), "error"),
-    Bit(7, ("bec", "undervoltage"), "error"),
-    Bit(8, ("bec", "overvoltage"), "error"),
-    Bit(9, ("reverse-polarity", "fuse"), "error"),
-    Bit(10, ("overvoltage", "fuse"), "error"),
-    Bit(11, ("power stage", "overtemperature"), "error"),
-    Bit(12, ("bec", "overtemperature"), "error"),
-    Bit(13, ("not all three", "motor phases", "connected"), "error"),
-    Bit(14, ("eeprom", "empty"), "error"),
-    Bit(15, ("eeprom", "stick positions", "configuration"), "error"),
-    Bit(16, ("eeprom", "checksum"), "error"),
-    Bit(17, ("eeprom", "size"), "error"),
-    Bit(18, ("eeprom", "version"), "error"),
+    Bit(0, "test_phase_low_side", ("motor phase", "low side", "does not switch"), "error"),
+    Bit(1, "test_phase_high_side", ("motor phase", "high side", "does not switch"), "error"),
+    Bit(2, "test_short_to_ground", ("short", "gnd", "rest level"), "error"),
+    Bit(3, "test_back_emf_offset", ("back-emf", "offset"), "error"),
+    Bit(4, "test_current_zero_point", ("current", "zero point"), "error"),
+    Bit(5, "test_undervoltage", ("undervoltage",), "error"),
+    Bit(6, "test_overvoltage", ("overvoltage",), "error"),
+    Bit(7, "test_bec_undervoltage", ("bec", "undervoltage"), "error"),
+    Bit(8, "test_bec_overvoltage", ("bec", "overvoltage"), "error"),
+    Bit(9, "test_reverse_polarity_fuse", ("reverse-polarity", "fuse"), "error"),
+    Bit(10, "test_overvoltage_fuse", ("overvoltage", "fuse"), "error"),
+    Bit(11, "test_power_stage_overtemp", ("power stage", "overtemperature"), "error"),
+    Bit(12, "test_bec_overtemperature", ("bec", "overtemperature"), "error"),
+    Bit(13, "test_motor_phase_missing", ("not all three", "motor phases", "connected"), "error"),
+    Bit(14, "test_eeprom_empty", ("eeprom", "empty"), "error"),
+    Bit(15, "test_eeprom_stick_positions", ("eeprom", "stick positions", "configuration"), "error"),
+    Bit(16, "test_eeprom_checksum", ("eeprom", "checksum"), "error"),
+    Bit(17, "test_eeprom_size", ("eeprom", "size"), "error"),
+    Bit(18, "test_eeprom_version", ("eeprom", "version"), "error"),
 ]
 
 # Recorded from an idle JIVE PRO 120, firmware 1.14, in the legacy layout. All other frames in these

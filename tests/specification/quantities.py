@@ -1,31 +1,26 @@
 """Every value that a DBC can send: its source, and the size of its step.
 
-These tables are typed from the vendor's sheet a second time, and do not import esc/kontronik. A
-misplaced row in either of the two is refuted by the proof. Sizes of units are repeated here for the
-same reason.
+They are derived from the fields of the protocol specification. Nothing of the package is used, so
+the proof refutes a misplaced row in either of the two descriptions. Sizes of units are repeated
+here for the same reason.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from fractions import Fraction
 
+import specification
+from specification import TYPE_RANGES
+
 HEADER = 4
 """Bytes of a UART frame before its first field."""
-WIRE_RANGES = {
-    "u8": (0, 0xFF),
-    "i8": (-0x80, 0x7F),
-    "u16": (0, 0xFFFF),
-    "i16": (-0x8000, 0x7FFF),
-    "u32": (0, 0xFFFF_FFFF),
-}
-"""Smallest and greatest number of each type of field."""
 _MOST_COUNTED = 1 << 48
 """Limit of a counter."""
 _MOST_ENERGY = 1 << 55
 """Limit of an energy in mW s."""
 _MOST_NS = 1 << 61
 """Limit of a time in ns."""
-_JIVEPRO = 3
 _BY_LIVE_DATA = ("energy_used", "motor_run_time")
 """Sums that increase with live data."""
 
@@ -68,7 +63,7 @@ class Read:
     offset: int = 0
     """Position of the field in the frame, header included."""
     wire: str = ""
-    """Type of the field, "" for a counter or state."""
+    """struct code of the field, "" for a counter or state."""
     shift: int = 0
     mask: int = 0
     """The steps are ``field >> shift & mask``. 0: the whole field."""
@@ -92,6 +87,8 @@ class Quantity:
     rolls: bool = False
     """True for a counter that restarts at 0 after the greatest value of its signal."""
     of_gateway: bool = False
+    names: Mapping[int, str] = field(default_factory=dict)
+    """Names of its numbers."""
 
     @property
     def pace(self) -> Pace:
@@ -107,43 +104,6 @@ class Quantity:
         return self.read.mask == 1
 
 
-_LIVE = """
-electrical_speed         4 u32 1/min 1
-battery_voltage          8 u16 V     100
-battery_current         10 i16 A     10
-motor_current           12 i16 A     10
-peak_current            14 i16 A     10
-consumed_charge         16 u16 mAh   1
-bec_current             18 u16 A     1000
-bec_voltage             20 u16 V     1000
-pwm_input               22 u16 us    1
-throttle                24 i8  %     1
-output_opening          25 u8  %     1
-power_stage_temperature 26 i8  degC  1
-bec_temperature         27 i8  degC  1
-operating_errors        28 u32 -     1
-operating_state         32 u8  -     1
-operating_state_raw     32 u8  -     1
-timing                  33 u8  us    1
-"""
-_INFO = """
-selftest_errors          8 u32 -     1
-cell_count              12 u8  -     1
-max_electrical_speed    13 u32 1/min 1
-min_battery_voltage     17 u16 V     100
-max_battery_voltage     19 u16 V     100
-max_battery_current     21 i16 A     10
-max_motor_current       23 i16 A     10
-max_peak_current        25 i16 A     10
-max_bec_current         27 u16 A     1000
-min_bec_voltage         29 u16 V     1000
-max_throttle            31 i8  %     1
-max_output_opening      32 u8  %     1
-min_power_stage_temperature 33 i8 degC 1
-max_power_stage_temperature 34 i8 degC 1
-min_bec_temperature     35 i8  degC  1
-max_bec_temperature     36 i8  degC  1
-"""
 _PARTS = """
 device        4 10 6
 device_raw    4 10 6
@@ -152,23 +112,6 @@ firmware_main 6 8 8
 firmware_sub  6 0 8
 """
 """Name, offset in the info frame, lowest bit and number of bits."""
-_OPERATING_BITS = """
-undervoltage overvoltage overcurrent_integral_error overcurrent_integral_warning
-power_stage_overtemp_warning power_stage_overtemp_error bec_undervoltage bec_overvoltage
-bec_overcurrent bec_overtemperature switched_off_by_running_down capacity_limit_reached
-operating_error_found operating_warning_found selftest_error eeprom_error watchdog_error_tripped
-programming_allowed limit_battery_voltage_minimum limit_current_maximum
-limit_power_stage_temperature limit_bec_temperature limit_bec_current limit_discharged_capacity
-"""
-"""The flags of the operating errors, from bit 0."""
-_SELFTEST_BITS = """
-test_phase_low_side test_phase_high_side test_short_to_ground test_back_emf_offset
-test_current_zero_point test_undervoltage test_overvoltage test_bec_undervoltage
-test_bec_overvoltage test_reverse_polarity_fuse test_overvoltage_fuse test_power_stage_overtemp
-test_bec_overtemperature test_motor_phase_missing test_eeprom_empty test_eeprom_stick_positions
-test_eeprom_checksum test_eeprom_size test_eeprom_version
-"""
-"""The flags of the self-test errors, from bit 0."""
 _COUNTERS = """
 losses crc_errors dropped_bytes live_frames info_frames received_bytes suspect_frames
 """
@@ -176,18 +119,24 @@ _COUNTERS_OF_GATEWAY = """
 sent_frames replaced_frames send_failures received_frames bus_off_count dropped_frames
 id_conflicts can_restarts
 """
-_STATES = """
-link_state 5
-layout 2
-"""
-"""Name and greatest number."""
-_STATES_OF_GATEWAY = """
-gateway_state 4
-can_state 5
-esc_count 255
-escs_ok 255
-"""
+LINKS = dict(enumerate(("NeverSeen", "Searching", "Ok", "Degraded", "Lost", "PortError")))
+LAYOUTS = dict(enumerate(("Unknown", "V4", "Legacy")))
+GATEWAY_STATES = dict(enumerate(("Starting", "Running", "Stopping", "Replay", "Quiet")))
+CAN_STATES = dict(
+    enumerate(("Unknown", "ErrorActive", "ErrorWarning", "ErrorPassive", "BusOff", "Down"))
+)
+_STATES: dict[str, Mapping[int, str]] = {"link_state": LINKS, "layout": LAYOUTS}
+_STATES_OF_GATEWAY: dict[str, Mapping[int, str]] = {
+    "gateway_state": GATEWAY_STATES,
+    "can_state": CAN_STATES,
+    "esc_count": {},
+    "escs_ok": {},
+}
+_MOST_ESCS = 255
 _NOT_ON_JIVEPRO = {"bec_current", "max_bec_current"}
+_SPELLINGS = str.maketrans({"µ": "u", "°": "deg"})
+_ARE_PARTS = ("device_and_variant", "firmware_word")
+"""Fields that are no value as a whole."""
 _PRODUCT = Read("battery voltage times battery current")
 _MS_PER_S = 1000
 _NS_PER_MS = 1_000_000
@@ -195,27 +144,32 @@ _NS_PER_S = 1_000_000_000
 _ENERGY_STEPS = 3_600_000
 
 
-def _fields(text: str, source: str, presence: Presence) -> dict[str, Quantity]:
+def _fields(
+    fields: Sequence[specification.Field], source: str, presence: Presence
+) -> dict[str, Quantity]:
     found = {}
-    for line in text.split("\n")[1:-1]:
-        name, offset, wire, unit, steps = line.split()
-        low, high = WIRE_RANGES[wire]
-        found[name] = Quantity(
-            Read(source, int(offset), wire),
+    for each in fields:
+        if each.name in _ARE_PARTS:
+            continue
+        low, high = TYPE_RANGES[each.code]
+        found[each.name] = Quantity(
+            Read(source, each.offset, each.code),
             low,
             high,
             presence,
-            unit.strip("-"),
-            int(steps),
-            not_on=frozenset({_JIVEPRO}) if name in _NOT_ON_JIVEPRO else frozenset(),
+            each.unit.translate(_SPELLINGS),
+            each.steps,
+            not_on=frozenset({specification.JIVEPRO} if each.name in _NOT_ON_JIVEPRO else ()),
         )
     return found
 
 
-def _flags(text: str, source: str, offset: int, presence: Presence) -> dict[str, Quantity]:
+def _flags(
+    bits: Sequence[specification.Bit], source: str, offset: int, presence: Presence
+) -> dict[str, Quantity]:
     found = {}
-    for bit, name in enumerate(text.split()):
-        found[name] = Quantity(Read(source, offset, "u32", bit, 1), 0, 1, presence)
+    for bit in bits:
+        found[bit.name] = Quantity(Read(source, offset, "I", bit.number, 1), 0, 1, presence)
     return found
 
 
@@ -224,24 +178,24 @@ def _parts() -> dict[str, Quantity]:
     for line in _PARTS.split("\n")[1:-1]:
         name, offset, shift, width = line.split()
         mask = (1 << int(width)) - 1
-        read = Read("info", int(offset), "u16", int(shift), mask)
+        read = Read("info", int(offset), "H", int(shift), mask)
         found[name] = Quantity(read, 0, mask, Presence.INFO)
     return found
 
 
 def _measured() -> dict[str, Quantity]:
     """Return the values that are computed from others, from time, or counted."""
-    speed = Read("live", 4, "u32")
-    most_speed = WIRE_RANGES["u32"][1]
-    voltage = WIRE_RANGES["u16"][1]
-    low_current, high_current = WIRE_RANGES["i16"]
+    speed = Read("live", 4, "I")
+    most_speed = TYPE_RANGES["I"][1]
+    voltage = TYPE_RANGES["H"][1]
+    low_current, high_current = TYPE_RANGES["h"]
     live = Presence.LIVE
     always = Presence.ALWAYS
     found = {
         "motor_speed": Quantity(speed, 0, most_speed, live, "1/min", 1, Divisor.POLES),
         "output_speed": Quantity(speed, 0, most_speed, live, "1/min", 1, Divisor.OUTPUT),
         "mean_cell_voltage": Quantity(
-            Read("live", 8, "u16"), 0, voltage, live, "V", 100, Divisor.CELLS
+            Read("live", 8, "H"), 0, voltage, live, "V", 100, Divisor.CELLS
         ),
         # 0.01 V times 0.1 A is 1 mW
         "battery_power": Quantity(
@@ -263,25 +217,35 @@ def _measured() -> dict[str, Quantity]:
             of_gateway=True,
         ),
     }
-    for names, of_gateway in ((_COUNTERS, False), (_COUNTERS_OF_GATEWAY, True)):
-        for name in names.split():
-            most = _MOST_COUNTED
-            found[name] = Quantity(Read(name), 0, most, always, rolls=True, of_gateway=of_gateway)
-    for lines, of_gateway in ((_STATES, False), (_STATES_OF_GATEWAY, True)):
-        for line in lines.split("\n")[1:-1]:
-            name, number = line.split()
-            found[name] = Quantity(Read(name), 0, int(number), always, of_gateway=of_gateway)
+    for words, of_gateway in ((_COUNTERS, False), (_COUNTERS_OF_GATEWAY, True)):
+        for name in words.split():
+            counter = Quantity(Read(name), 0, _MOST_COUNTED, always, rolls=True)
+            found[name] = replace(counter, of_gateway=of_gateway)
+    for states, of_gateway in ((_STATES, False), (_STATES_OF_GATEWAY, True)):
+        for name, names in states.items():
+            state = Quantity(Read(name), 0, max(names, default=_MOST_ESCS), always, names=names)
+            found[name] = replace(state, of_gateway=of_gateway)
     return found
 
 
-QUANTITIES = {
-    **_fields(_LIVE, "live", Presence.LIVE),
-    **_fields(_INFO, "info", Presence.INFO),
-    **_flags(_OPERATING_BITS, "live", 28, Presence.LIVE),
-    **_flags(_SELFTEST_BITS, "info", 8, Presence.INFO),
-    **_parts(),
-    **_measured(),
-}
+def _all() -> dict[str, Quantity]:
+    live = _fields(specification.LIVE_FIELDS, "live", Presence.LIVE)
+    state = live["operating_state"]
+    found = {
+        **live,
+        "operating_state": replace(state, names=specification.OPERATING_STATES),
+        "operating_state_raw": state,
+        **_fields(specification.INFO_FIELDS, "info", Presence.INFO),
+        **_flags(specification.OPERATING_BITS, "live", 28, Presence.LIVE),
+        **_flags(specification.SELFTEST_BITS, "info", 8, Presence.INFO),
+        **_parts(),
+        **_measured(),
+    }
+    found["device"] = replace(found["device"], names=specification.DEVICES)
+    return found
+
+
+QUANTITIES = _all()
 """Every value by its name."""
 PRODUCT = _PRODUCT
 

@@ -8,17 +8,17 @@ and the ESC of each copy are derived in messages.py.
 """
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import Enum
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-from specification.quantities import QUANTITIES, Quantity, size
+from specification.quantities import QUANTITIES, size
+from specification.rule import Described, Rule, Shape
 
 from dbc_proof.end_to_end import COUNTERS, CrcRule, expected_rule
 from dbc_proof.messages import SentMessage, sent_messages
-from dbc_proof.sending import Sending, attribute_of, has_own_attribute, letters_of, sending_of
+from dbc_proof.sending import Sending, attribute_of, has_own_attribute, sending_of
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.e2e_attributes import role_of
 from kontronik_can_gw.dbc.names import Binder, is_data_id, protection
@@ -29,76 +29,6 @@ from kontronik_can_gw.signals.plan import Role
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Signal
-
-_TEXTS_OF_NOT_AVAILABLE = ("notavailable", "sna", "na", "signalnotavailable")
-_TEXTS_OF_ERROR = ("error", "err", "invalid")
-_HALF = Fraction(1, 2)
-
-
-class Shape(Enum):
-    """How the raw value of a signal is computed."""
-
-    NUMBER = "number"
-    FLAG = "flag in one bit"
-    COUNTER = "counter"
-    NAMES = "enumeration"
-    FLOAT = "float"
-    ALIVE = "alive counter"
-    CRC = "CRC"
-    CONSTANT = "constant"
-
-
-@dataclass(frozen=True)
-class Expected:
-    """The meaning of a signal's raw values, and how they are computed."""
-
-    shape: Shape
-    length: int
-    signed: bool
-    factor: Fraction
-    offset: Fraction
-    minimum: Fraction | None
-    """Smallest physical value. None: no limit."""
-    maximum: Fraction | None
-    not_available: int
-    error: int
-    codes: frozenset[int]
-    """All raw values that mean "not available" or "error"."""
-    quantity: Quantity | None = None
-    esc: int | None = None
-    scale: Fraction = Fraction(1)
-    shift: Fraction = Fraction(0)
-    """``number in the signal's unit = number in the quantity's unit * scale + shift``."""
-    numbers: Mapping[int, int] = field(default_factory=dict)
-    """NAMES: raw value of each number that has a name in the value table."""
-    constant: int = 0
-    has_code: bool = False
-    """True if the value table has a text for "not available"."""
-    modulus: int = 0
-    """COUNTER and ALIVE: number of values."""
-
-    @property
-    def lowest(self) -> int:
-        return -(1 << self.length - 1) if self.signed else 0
-
-    @property
-    def highest(self) -> int:
-        return self.lowest + (1 << self.length) - 1
-
-    def physical(self, raw: int) -> Fraction:
-        return raw * self.factor + self.offset
-
-    def exact(self, value: Fraction) -> Fraction:
-        """Return the exact raw value of a number in the quantity's unit, not rounded yet."""
-        return (value * self.scale + self.shift - self.offset) / self.factor
-
-    def is_value(self, raw: int) -> bool:
-        """Return True if a raw value is within bits and limits, and not a code."""
-        if not self.lowest <= raw <= self.highest or raw in self.codes:
-            return False
-        if self.minimum is None or self.maximum is None:
-            return True
-        return self.minimum <= self.physical(raw) <= self.maximum
 
 
 @dataclass(frozen=True)
@@ -112,7 +42,7 @@ class ExpectedSignal:
     page: int | None
     bits: tuple[int, ...]
     """Position in the frame of each bit of the raw value, counted from bit 0 of byte 0."""
-    rule: Expected | None
+    rule: Rule | None
     """None if the specification does not cover the signal."""
     reason: str = ""
     """The reason in that case."""
@@ -265,22 +195,30 @@ class _Signal:
         self.protection = protection
         """E2E profile and data ids of the message. None without a CRC."""
         self.unit = _unit(signal, settings)
-        texts: list[tuple[int, str]] = []
-        for raw, text in (signal.choices or {}).items():
-            texts.append((int(raw), letters_of(str(text))))
-        self.texts = texts
-        self.start, self.start_is_set = self._start_value()
+        start, has_own_start = self._start_value()
+        self.described = Described(
+            length=signal.length,
+            signed=signal.is_signed,
+            is_float=signal.is_float,
+            factor=_exact(signal.scale),
+            offset=_exact(signal.offset),
+            limits=(_exact(signal.minimum or 0), _exact(signal.maximum or 0)),
+            texts=[(int(raw), str(text)) for raw, text in (signal.choices or {}).items()],
+            start=start,
+            has_own_start=has_own_start,
+        )
 
     def made(self, page: int | None) -> ExpectedSignal:
         """Return the specification on a page."""
         name = self.sent.prefix + self.signal.name
         bits = bits_of(self.signal)
         source = ""
-        rule: Expected | None = None
+        rule: Rule | None = None
         reason = ""
         bound = self.binder.bound(self.sent.for_binder, self.signal.name)
         if isinstance(bound, (int, float)):
-            rule = self._constant((_exact(bound) - self._offset) / self._factor)
+            offset, factor = self.described.offset, self.described.factor
+            rule = self._constant((_exact(bound) - offset) / factor)
         else:
             role = role_of(self.signal, self.database) if bound is None else None
             known_name = bound or self.signal.name
@@ -293,7 +231,10 @@ class _Signal:
                 elif value.name not in QUANTITIES:
                     reason = f"{value.name} is not in the sheet of the proof"
                 else:
-                    rule = self._with_source(QUANTITIES[value.name], esc, value.names)
+                    quantity = QUANTITIES[value.name]
+                    conversion = _conversion(quantity.unit, self.unit)
+                    on_loss = self.settings.flags_on_loss
+                    rule = self.described.of_quantity(quantity, esc, conversion, on_loss)
             elif self._has_data_id_nibble and is_data_id(known_name):
                 assert self.protection is not None
                 rule = self._constant(self.protection[1][0] >> 8 & 0xF)
@@ -305,14 +246,6 @@ class _Signal:
     def _has_data_id_nibble(self) -> bool:
         """True if the frame contains 4 bits of the data id."""
         return self.protection is not None and self.protection[0] in ("1C", "11C")
-
-    @property
-    def _factor(self) -> Fraction:
-        return _exact(self.signal.scale)
-
-    @property
-    def _offset(self) -> Fraction:
-        return _exact(self.signal.offset)
 
     def _start_value(self) -> tuple[int | None, bool]:
         """Return the raw start value, and True if this signal has one of its own.
@@ -330,149 +263,30 @@ class _Signal:
         fits = raw.denominator == 1 and 0 <= raw - lowest < 1 << self.signal.length
         return (int(raw) if fits else None), own
 
-    def _raws(self, texts: Sequence[str]) -> list[int]:
-        """Return the raw values whose text in the value table is one of these.
-
-        The first one is sent. If its text is in the table twice, this is the last with the text.
-        """
-        found = [(raw, text) for raw, text in self.texts if text in texts]
-        if found:
-            first = found[0][1]
-            last = [each for each in found if each[1] == first][-1]
-            found.remove(last)
-            found.insert(0, last)
-        return [raw for raw, _ in found]
-
-    def _base(self, shape: Shape, **more: Any) -> Expected:
-        """Return a rule with the limits and codes of the file."""
-        signal = self.signal
-        minimum = maximum = None
-        limits = (signal.minimum, signal.maximum)
-        if None not in limits and limits != (0, 0):
-            minimum, maximum = sorted(map(_exact, limits))
-        named = self._raws(_TEXTS_OF_NOT_AVAILABLE)
-        errors = self._raws(_TEXTS_OF_ERROR)
-        if named:
-            not_available = named[0]
-        elif self.start is not None and (self.start_is_set or signal.length == 1):
-            not_available = self.start
-        elif signal.is_signed:
-            not_available = -(1 << signal.length - 1)
-        else:
-            not_available = (1 << signal.length) - 1
-        given: dict[str, Any] = {
-            "shape": shape,
-            "length": signal.length,
-            "signed": signal.is_signed,
-            "factor": self._factor,
-            "offset": self._offset,
-            "minimum": minimum,
-            "maximum": maximum,
-            "not_available": not_available,
-            "error": errors[0] if errors else not_available,
-            "codes": frozenset((*named, *errors)),
-            "has_code": bool(named),
-        }
-        return Expected(**given | more)
-
-    def _constant(self, raw: Fraction | int | None) -> Expected:
+    def _constant(self, raw: Fraction | int | None) -> Rule:
         """Return the rule of a constant with an exact raw value."""
         if self.signal.is_float:
             bits = raw if isinstance(raw, int) else _float_bits(raw or 0, self.signal.length)
-            return self._base(Shape.CONSTANT, constant=bits, codes=frozenset())
-        assert raw is None or raw == int(raw)
-        return self._base(Shape.CONSTANT, constant=int(raw or 0), codes=frozenset())
+        else:
+            assert raw is None or raw == int(raw)
+            bits = int(raw or 0)
+        base = self.described.base()
+        return replace(base, shape=Shape.CONSTANT, constant=bits, codes=frozenset())
 
-    def _without_source(self, role: Role | None) -> Expected:
+    def _without_source(self, role: Role | None) -> Rule:
         """Return the rule of a counter of frames, a CRC, or a signal that is bound to nothing."""
+        described = self.described
         if role is Role.CRC:
-            return self._base(Shape.CRC)
+            return replace(described.base(), shape=Shape.CRC)
         if role is Role.ALIVE:
-            modulus = self._modulus()
-            if self.protection is not None:
-                modulus = min(modulus, COUNTERS[self.protection[0]])
-            return self._base(Shape.ALIVE, modulus=modulus)
-        named = self._raws(_TEXTS_OF_NOT_AVAILABLE)
-        if named and not self.start_is_set:
+            most = None if self.protection is None else COUNTERS[self.protection[0]]
+            return described.counted(Shape.ALIVE, most)
+        named = described.named_not_available
+        if named and not described.has_own_start:
             if self.signal.is_float:
                 return self._constant(_float_bits(named[0], self.signal.length))
             return self._constant(named[0])
-        return self._constant(self.start)
-
-    def _modulus(self) -> int:
-        """Return the number of values of a counter, which restarts before the first code."""
-        rule = self._base(Shape.NUMBER)
-        greatest = rule.highest
-        if rule.maximum is not None and rule.minimum is not None:
-            ends = [(end - rule.offset) / rule.factor for end in (rule.minimum, rule.maximum)]
-            greatest = min(greatest, max(ends).__floor__())
-        codes = [code for code in rule.codes if code >= 0]
-        return min([greatest + 1, *codes])
-
-    def _with_source(
-        self, quantity: Quantity, esc: int | None, names: Mapping[int, str]
-    ) -> Expected:
-        """Return the rule of a signal that shows a value."""
-        scale, shift = _conversion(quantity.unit, self.unit)
-        shape = Shape.FLOAT if self.signal.is_float else Shape.NUMBER
-        base = self._base(shape, quantity=quantity, esc=esc, scale=scale, shift=shift)
-        if self.signal.is_float:
-            return base
-        numbers = self._numbers(names)
-        if numbers:
-            return self._base(Shape.NAMES, quantity=quantity, esc=esc, numbers=numbers)
-        if quantity.rolls:
-            return self._base(
-                Shape.COUNTER,
-                quantity=quantity,
-                esc=esc,
-                modulus=self._modulus(),
-            )
-        has_no_code = not self._raws(_TEXTS_OF_NOT_AVAILABLE)
-        if quantity.is_flag and self.signal.length == 1 and has_no_code:
-            return self._flag(base)
-        # Without a text for it, the code is nevertheless not a value.
-        return self._base(
-            shape,
-            quantity=quantity,
-            esc=esc,
-            scale=scale,
-            shift=shift,
-            codes=base.codes | {base.not_available},
-        )
-
-    def _flag(self, base: Expected) -> Expected:
-        """Return the rule of a flag in one bit, which needs both raw values for its value."""
-        lost = self.settings.flags_on_loss
-        if lost is None and self.start_is_set and self.start is not None:
-            lost_raw = self.start
-        else:
-            lost_raw = (base.exact(Fraction(lost or 0)) + _HALF).__floor__()
-        return Expected(
-            shape=Shape.FLAG,
-            length=1,
-            signed=base.signed,
-            factor=base.factor,
-            offset=base.offset,
-            minimum=None,
-            maximum=None,
-            not_available=lost_raw,
-            error=lost_raw,
-            codes=frozenset(),
-            quantity=base.quantity,
-            esc=base.esc,
-            scale=base.scale,
-            shift=base.shift,
-        )
-
-    def _numbers(self, names: Mapping[int, str]) -> dict[int, int]:
-        """Return the raw value of each number whose name is in the value table."""
-        found = {}
-        for number, name in names.items():
-            for raw, text in self.texts:
-                if text == letters_of(name):
-                    found[number] = raw
-        return found
+        return self._constant(described.start)
 
 
 def _exact(number: Any) -> Fraction:

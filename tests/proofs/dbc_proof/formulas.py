@@ -12,9 +12,10 @@ from fractions import Fraction
 from typing import Any
 
 import z3  # type: ignore[import-untyped]
-from specification.quantities import WIRE_RANGES, Divisor, Presence, Read
+from specification import TYPE_RANGES
+from specification.quantities import Divisor, Presence, Read
+from specification.rule import Rule, Shape
 
-from dbc_proof.expected import Expected, Shape
 from dbc_proof.planned import INT64_END, LARGEST, Planned
 
 TIMEOUT_MS = 10_000
@@ -74,7 +75,7 @@ class Verdict:
     """The reason why nothing is proven and nothing is refuted."""
 
 
-def compare(expected: Expected, planned: Planned, settings: Settings) -> Verdict:
+def compare(expected: Rule, planned: Planned, settings: Settings) -> Verdict:
     """Prove that a plan sends the bits that its DBC defines, or find a counter-example.
 
     ``settings`` are tried first for a counter-example. The rule has a quantity, and no floats. Both
@@ -100,7 +101,7 @@ def compare(expected: Expected, planned: Planned, settings: Settings) -> Verdict
     )
 
 
-def _all_settings(first: Settings, planned: Planned, expected: Expected) -> Iterator[Settings]:
+def _all_settings(first: Settings, planned: Planned, expected: Rule) -> Iterator[Settings]:
     """Yield the settings for which a counter-example is looked for."""
     yield first
     assert expected.quantity is not None
@@ -123,7 +124,7 @@ class _World:
     Without ``settings``, divided values are any real numbers within their bounds.
     """
 
-    expected: Expected
+    expected: Rule
     planned: Planned
     settings: Settings | None
     facts: list[Any] = field(default_factory=list)
@@ -206,7 +207,7 @@ class _World:
             x = z3.Int(name)
             self.facts += [low <= x, x <= high]
             return x
-        low, high = WIRE_RANGES[read.wire]
+        low, high = TYPE_RANGES[read.wire]
         size = (high - low).bit_length() // _BYTE
         term: Any = 0
         for place in range(size):
@@ -292,11 +293,9 @@ class _World:
         self.facts += [-half < distance, distance <= half]
         if rule.shape is Shape.COUNTER:
             return self._modulo(raw, rule.modulus, "round")
-        conditions = [rule.lowest <= raw, raw <= rule.highest]
+        low, high = rule.raw_limits
+        conditions = [low <= raw, raw <= high]
         conditions += [raw != code for code in sorted(rule.codes)]
-        if rule.minimum is not None and rule.maximum is not None:
-            physical = z3.ToReal(raw) * _real(rule.factor) + _real(rule.offset)
-            conditions += [_real(rule.minimum) <= physical, physical <= _real(rule.maximum)]
         return z3.If(z3.And(conditions), raw, z3.IntVal(rule.error))
 
     def _modulo(self, number: Any, modulus: int, name: str) -> Any:
@@ -373,7 +372,7 @@ class _World:
         return (value - rule.lowest) % (1 << rule.length) + rule.lowest
 
 
-def received(expected: Expected, bits: int) -> int:
+def received(expected: Rule, bits: int) -> int:
     """Return the raw value that a receiver reads for the lowest bits of a number."""
     return (bits - expected.lowest) % (1 << expected.length) + expected.lowest
 

@@ -29,8 +29,7 @@ from kontronik_can_gw.native.tables import ALL_ESCS, Tables
 from kontronik_can_gw.signals.packer import alive_modulus, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 
-_WIRES = {"B": "u8", "b": "i8", "H": "u16", "h": "i16", "I": "u32"}
-_C_WIRES = {KCG.U8: "u8", KCG.I8: "i8", KCG.U16: "u16", KCG.I16: "i16", KCG.U32: "u32"}
+_C_WIRES = {KCG.U8: "B", KCG.I8: "b", KCG.U16: "H", KCG.I16: "h", KCG.U32: "I"}
 _DIVISORS = {
     values.Divisor.ONE: Divisor.ONE,
     values.Divisor.POLE_PAIRS: Divisor.POLES,
@@ -193,7 +192,7 @@ def _offsets(wire: Any) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
     for places, (codes, _) in zip(found, wire or (), strict=False):
         at = HEADER
         for code in codes:
-            places.append((at, _WIRES[code]))
+            places.append((at, code))
             at += struct.calcsize("<" + code)
     return found
 
@@ -211,7 +210,7 @@ def _python_plan(
         presence = Presence.KNOWN_INFO
     if value.kind is values.Kind.PRODUCT:
         fields = [offsets[is_info][word] for word in value.words]
-        is_power = fields == [(8, "u16"), (10, "i16")]
+        is_power = fields == [(8, "H"), (10, "h")]
         read = PRODUCT if is_power else Read(f"product of the fields {fields}")
     elif value.words:
         offset, wire = offsets[is_info][value.words[0]]

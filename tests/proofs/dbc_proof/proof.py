@@ -5,15 +5,11 @@ from dataclasses import asdict, dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
+from specification.rule import Rule, Shape
+
 from dbc_proof import words
 from dbc_proof.end_to_end import CrcRule
-from dbc_proof.expected import (
-    Expected,
-    ExpectedMessage,
-    ExpectedSignal,
-    Shape,
-    expected_messages,
-)
+from dbc_proof.expected import ExpectedMessage, ExpectedSignal, expected_messages
 from dbc_proof.formulas import Settings, Verdict, compare, received
 from dbc_proof.planned import (
     INT64_END,
@@ -194,7 +190,7 @@ class Prover:
                 findings.without_code.append(where)
 
     def _counter_examples(
-        self, signal: ExpectedSignal, rule: Expected, plan: PlannedMessage, reasons: list[str]
+        self, signal: ExpectedSignal, rule: Rule, plan: PlannedMessage, reasons: list[str]
     ) -> Iterator[str]:
         """Yield counter-examples of one plan. Adds a line to ``reasons`` if nothing is known."""
         if rule.shape is Shape.CONSTANT:
@@ -242,7 +238,7 @@ class Prover:
     def _name(self, esc: int | None) -> str:
         return "the gateway" if esc is None else f"ESC {self._escs[esc].name}"
 
-    def _verdict(self, rule: Expected, plan: Planned) -> Verdict:
+    def _verdict(self, rule: Rule, plan: Planned) -> Verdict:
         """Return the verdict about a plan. Copies for other ESCs have the same."""
         esc = self._escs[rule.esc or 0]
         settings = Settings(esc.pole_pairs, esc.gear, esc.cell_count or 1)
@@ -263,7 +259,7 @@ def _is_on(planned: PlannedSignal, signal: ExpectedSignal) -> bool:
     return planned.name == signal.name and planned.page == signal.page
 
 
-def _lacks_code(rule: Expected) -> bool:
+def _lacks_code(rule: Rule) -> bool:
     """Return True if the code for "not available" may also be sent for a value."""
     if rule.quantity is None or rule.has_code or rule.shape is Shape.COUNTER:
         return False
@@ -274,7 +270,7 @@ def _lacks_code(rule: Expected) -> bool:
     return replace(rule, codes=frozenset()).is_value(rule.not_available)
 
 
-def _shared_codes(signal: ExpectedSignal, rule: Expected) -> Iterator[str]:
+def _shared_codes(signal: ExpectedSignal, rule: Rule) -> Iterator[str]:
     """Yield the counter values that are codes of the value table."""
     if rule.shape in (Shape.ALIVE, Shape.COUNTER):
         for code in sorted(code for code in rule.codes if 0 <= code < rule.modulus):
@@ -323,7 +319,7 @@ def _id(message: ExpectedMessage | PlannedMessage) -> str:
     return f"{message.can_id:08X}h" if message.extended else f"{message.can_id:03X}h"
 
 
-def _wrong_constant(signal: ExpectedSignal, rule: Expected, plan: PlannedMessage) -> Iterator[str]:
+def _wrong_constant(signal: ExpectedSignal, rule: Rule, plan: PlannedMessage) -> Iterator[str]:
     for page, bits in plan.constants.items():
         if signal.page not in (None, page):
             continue
@@ -345,7 +341,7 @@ def _read(bits: Sequence[int], frame: int) -> int:
     return sum((frame >> at & 1) << number for number, at in enumerate(bits))
 
 
-def _wrong_bits(signal: ExpectedSignal, rule: Expected, pieces: Sequence[Piece]) -> Iterator[str]:
+def _wrong_bits(signal: ExpectedSignal, rule: Rule, pieces: Sequence[Piece]) -> Iterator[str]:
     """Yield the first bit of the raw value that is not sent at its place.
 
     Each bit is placed by itself, so the places of all bits follow from the places of each.

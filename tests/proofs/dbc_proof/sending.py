@@ -10,6 +10,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from specification.quantities import Pace
+from specification.rule import letters_of
 
 import kontronik_can_gw.dbc
 from kontronik_can_gw.config.output_keys import DbcConfig
@@ -66,11 +67,6 @@ def attribute_of(owner: Any, name: str, database: "Database") -> Any:
 def has_own_attribute(owner: Any, name: str) -> bool:
     """Return True if the file has the attribute for this message or signal."""
     return owner.dbc is not None and name in owner.dbc.attributes
-
-
-def letters_of(text: str) -> str:
-    """Return letters and digits. Only they count when texts of a DBC are compared."""
-    return "".join(filter(str.isalnum, text.lower()))
 
 
 def sending_of(

@@ -2,12 +2,13 @@
 
 from fractions import Fraction
 
+from specification import DEVICES
 from specification.quantities import Divisor, Presence
+from specification.rule import Rule, Shape
 
-from dbc_proof.expected import Expected, ExpectedSignal, Shape
+from dbc_proof.expected import ExpectedSignal
 from dbc_proof.formulas import CounterExample, Settings
 
-_DEVICES = {1: "KOSMIK", 2: "KOLIBRI", 3: "JIVEPro", 4: "KONTROL-X", 5: "UHV"}
 _CAUSES = {
     Presence.LIVE: "without fresh live data",
     Presence.INFO: "without fresh info data",
@@ -46,7 +47,7 @@ def _value(signal: ExpectedSignal, value: Fraction, steps: int) -> str:
     return f"{decimal(value * rule.scale + rule.shift)} {unit}".rstrip()
 
 
-def _details(rule: Expected, settings: Settings, device: int | None) -> str:
+def _details(rule: Rule, settings: Settings, device: int | None) -> str:
     assert rule.quantity is not None
     divisor = rule.quantity.divisor
     details = ""
@@ -58,8 +59,8 @@ def _details(rule: Expected, settings: Settings, device: int | None) -> str:
         details += f" with {settings.cells} cells"
     if device is not None:
         details += f" of device {device}"
-        if device in _DEVICES:
-            details += f" ({_DEVICES[device]})"
+        if device in DEVICES:
+            details += f" ({DEVICES[device]})"
     return details
 
 
