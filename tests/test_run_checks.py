@@ -4,6 +4,8 @@ A step that failed, did not run or left no report never counts as passed.
 """
 
 import re
+import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +91,24 @@ def test_a_step_without_its_tools_is_not_run_and_the_remedy_is_named(
     result = checks.run("faults", 60, tmp_path, (), False)
     assert result.state == "not run"
     assert result.note == "there is no no-such-program"
-    assert checks.summarize([result], strict=False) == 0
-    assert checks.summarize([result], strict=True) == 1
-    assert "to enable it:  sudo make one" in capsys.readouterr().out
+    assert checks.summarize([result], strict=False) == 1
+    shown = capsys.readouterr().out
+    assert "to enable it:  sudo make one" in shown
+    assert "to leave it out:  --without faults" in shown
+
+
+def test_a_step_that_cannot_run_can_be_left_out_by_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(checks.NEEDS, "lint", ("no-such-program", "sudo make one"))
+    monkeypatch.setitem(checks.STEPS, "types", "true")
+    monkeypatch.setattr(checks, "use_defaults_in_children", lambda: None)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    words = ["run.py", "test", "--only", "lint", "--only", "types"]
+    for further, code in (((), 1), (("--without", "lint"), 0)):
+        monkeypatch.setattr(sys, "argv", [*words, *further])
+        assert checks.main() == code
+        assert ("not run: lint" in capsys.readouterr().out) == bool(code)
 
 
 @pytest.mark.parametrize(
