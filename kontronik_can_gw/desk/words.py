@@ -1,8 +1,12 @@
-"""Formats times, durations and numbers for people."""
+"""Formats times, durations, numbers and names for people."""
 
+import re
 from datetime import UTC, datetime
 
 from kontronik_can_gw.times import SECOND
+
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W_]")
+"""An acronym, a word, a number, or a single character."""
 
 
 def clock(time_ns: int) -> str:
@@ -44,3 +48,17 @@ def wall_clock(wall_ns: int) -> str:
         return datetime.fromtimestamp(wall_ns // SECOND, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     except (OverflowError, OSError, ValueError):
         return f"{wall_ns // SECOND} s of Unix time"
+
+
+def words(text: str) -> str:
+    """Return a name as separate words.
+
+    ``SpoolUpFromStill`` becomes ``spool up from still``, ``RpmControl`` becomes ``RPM control``.
+    """
+    parts = []
+    for part in _WORD.findall(text):
+        is_acronym = len(part) > 1 and part.isupper()
+        if not is_acronym:
+            part = part.lower()
+        parts.append(part)
+    return " ".join(parts).replace("rpm", "RPM")

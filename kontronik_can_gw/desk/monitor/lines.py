@@ -1,6 +1,5 @@
 """Makes printable lines of text for a terminal: words, numbers and tables. Pure."""
 
-import re
 import textwrap
 from collections.abc import Iterable, Sequence
 
@@ -27,9 +26,6 @@ _KINDS = {
     Severity.WARNING: ("WARNING", "yellow"),
 }
 """Head and style of an alarm. Other alarms are notes."""
-_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W_]")
-"""An acronym, a word, a number, or a single character."""
-
 Part = str | tuple[str, str] | Text
 """Text without a style, text with a style of rich, or a finished part of a line."""
 
@@ -116,20 +112,6 @@ def cut(lines: list[Text], room: int) -> list[Text]:
     omitted = len(lines) - len(kept)
     kept.append(line((f"... and {omitted} more lines: enlarge the terminal", "dim")))
     return kept
-
-
-def words(text: str) -> str:
-    """Return a name as separate words.
-
-    ``SpoolUpFromStill`` becomes ``spool up from still``, ``RpmControl`` becomes ``RPM control``.
-    """
-    parts = []
-    for part in _WORD.findall(text):
-        is_acronym = len(part) > 1 and part.isupper()
-        if not is_acronym:
-            part = part.lower()
-        parts.append(part)
-    return " ".join(parts).replace("rpm", "RPM")
 
 
 def shorten(name: str, width: int) -> str:

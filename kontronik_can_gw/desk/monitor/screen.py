@@ -3,11 +3,11 @@
 It is a table of all ESCs, or the page of one ESC with all its values. Pure.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from rich.text import Text
 
-from kontronik_can_gw.desk.member import Alarm, Flag, alarms_of
+from kontronik_can_gw.desk.member import Alarm, alarms_of
 from kontronik_can_gw.desk.monitor.charts import MARKS, chart_heights, chart_rows, sparkline
 from kontronik_can_gw.desk.monitor.lines import (
     STATES,
@@ -18,30 +18,28 @@ from kontronik_can_gw.desk.monitor.lines import (
     number,
     shorten,
     table,
-    words,
     wrapped,
 )
 from kontronik_can_gw.desk.monitor.model import (
     HISTORY_S,
     QUANTITIES,
-    SILENCE_NS,
     Esc,
     Monitor,
     Quantity,
 )
+from kontronik_can_gw.desk.monitor.notices import Kind, link_of, notices, trouble_of
 from kontronik_can_gw.desk.sources import Source
+from kontronik_can_gw.desk.words import words
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.value_names import normalize
-from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.runtime.system.fault_log import duration
 from kontronik_can_gw.times import MS
 
-_NO_TELEMETRY = "no telemetry{since}: is the ESC powered and its cable plugged in?"
-_TROUBLES = {
-    "searching": (
-        "bytes but no telemetry: is it the right port? Does the ESC send {protocol} telemetry?"
-    ),
-    "porterror": "the gateway cannot open the port: see its log, or kontronik-can-gw status",
+_NOTICE_STYLES = {
+    Kind.REPLAY: "bold black on yellow",
+    Kind.FAULT: "bold red",
+    Kind.HINT: "yellow",
+    Kind.WAITING: "dim",
 }
 _PAGE_WIDTHS = (16, 5, 8, 8, 8)
 """Minimum widths of a page's columns: name, unit, value, minimum, maximum."""
@@ -82,8 +80,8 @@ def screen(
     last = max(4, rows) - 1
     """Index of the last line."""
     lines = [_title(monitor, source)]
-    for text, style in notices(monitor, source):
-        lines += wrapped(text, style, width)
+    for text, kind in notices(monitor, source):
+        lines += wrapped(text, _NOTICE_STYLES[kind], width)
     escs = monitor.escs
     if page:
         escs = escs[page - 1 : page]
@@ -116,30 +114,6 @@ def _table_body(escs: Sequence[Esc], width: int, room: int) -> list[Text]:
     body = cut(table_of(escs, width), max(2, room - alarm_count))
     chart_room = room - _ALARM_LINES - len(body)
     return body + _histories(escs, width, chart_room)
-
-
-def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, str]]:
-    """Yield notices about gateway and source with their styles."""
-    frames = f"frames of {monitor.file} on {source.name}"
-    if monitor.is_replay and not source.is_file:
-        text = "REPLAY: the gateway plays a recording; these are not values of a live ESC."
-        yield text, "bold black on yellow"
-    if source.problem:
-        yield source.problem, "bold red"
-    elif source.ended and not monitor.view.frames:
-        text = f"{source.name} contains no frame of {monitor.file}."
-        yield f"{text} Give the DBC of its frames (-c, --dbc).", "bold red"
-    elif monitor.silent_ns >= SILENCE_NS and not source.is_file:
-        yield f"no {frames}", "bold red"
-        for hint in source.hints:
-            yield hint, "yellow"
-    elif not monitor.view.frames and not source.is_file:
-        yield f"waiting for {frames} ...", "dim"
-    count = monitor.gateway.number("esc_count")
-    known = len(monitor.escs)
-    if count is not None and count > known:
-        text = f"the gateway has {count:.0f} ESCs, but the DBC in use describes {known}. "
-        yield text + "Give its configuration (-c) or DBC (--dbc).", "yellow"
 
 
 def _title(monitor: Monitor, source: Source) -> Text:
@@ -176,15 +150,7 @@ def _foot(count: int, source: Source, keys: bool) -> Text:
 
 
 def _link_part(esc: Esc) -> Part:
-    link = "-"
-    if esc.link is not None:
-        link = words(esc.link)
-    elif esc.is_known(Group.LIVE) and not esc.has("link_state"):
-        link = "ok"
-    text = link
-    rate = esc.number("frame_rate")
-    if rate is not None and link == "ok":
-        text = f"ok {rate:.0f} Hz"
+    link, text = link_of(esc)
     return text, STATES.get(link, "bold red")
 
 
@@ -224,23 +190,6 @@ def _value_part(esc: Esc, quantity: Quantity) -> Part:
     return mark + text, MARKS[mark]
 
 
-def _trouble(esc: Esc) -> Flag | None:
-    """Return the fault of an ESC's link with its remedy. None if there is no fault."""
-    link = normalize(esc.link or "")
-    if esc.is_known(Group.LIVE) or link in ("", "ok"):
-        if link != "degraded":
-            return None
-        remedy = "Check cable and ground."
-        return Flag("link", Severity.WARNING, "frames are damaged", remedy)
-    age = esc.number("data_age")
-    since = ""
-    if age is not None and link != "neverseen":
-        since = f" for {duration(round(age * MS))}"
-    text = _TROUBLES.get(link, _NO_TELEMETRY)
-    text = text.format(protocol=esc.protocol.name.upper(), since=since)
-    return Flag("link", Severity.ERROR, text)
-
-
 def alarms(escs: Sequence[Esc], width: int, room: int = 999) -> list[Text]:
     """Return the errors and warnings of the ESCs."""
     found: list[tuple[str, Alarm]] = []
@@ -249,7 +198,7 @@ def alarms(escs: Sequence[Esc], width: int, room: int = 999) -> list[Text]:
         if len(escs) > 1:
             prefix = f"{esc.name} "
         flags = list(esc.active)
-        trouble = _trouble(esc)
+        trouble = trouble_of(esc)
         if trouble:
             flags.insert(0, trouble)
         for flag in alarms_of(flags):

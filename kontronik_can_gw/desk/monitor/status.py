@@ -23,9 +23,9 @@ from kontronik_can_gw.desk.monitor.lines import (
     line,
     number,
     table,
-    words,
     wrapped,
 )
+from kontronik_can_gw.desk.words import words
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.native.load import in_words

@@ -16,7 +16,8 @@ from rich.text import Text
 
 from kontronik_can_gw.desk.monitor.lines import wrapped
 from kontronik_can_gw.desk.monitor.model import Monitor
-from kontronik_can_gw.desk.monitor.screen import alarms, notices, screen, table_of
+from kontronik_can_gw.desk.monitor.notices import notices
+from kontronik_can_gw.desk.monitor.screen import alarms, screen, table_of
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
