@@ -1,6 +1,6 @@
 """Renders a flight as one HTML page that needs no network.
 
-The page consists of template files, uPlot, and the data as packed JSON. The output is
+The page consists of template files, the common look, and the data as packed JSON. The output is
 deterministic.
 """
 
@@ -15,6 +15,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from kontronik_can_gw.desk import look
 from kontronik_can_gw.desk.report.esc import Number
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.quantities import PHASES, PLOTS, Plot
@@ -43,16 +44,12 @@ def render(
     ``source`` is the input's name. ``wall_ns`` is the Unix time of the recording's time 0, or None
     if it is unknown.
     """
-    style = _file("vendor/uPlot.min.css") + _file("page.css")
-    library = _file("vendor/uPlot.iife.min.js")
-    script = _file("page.js")
-    policy = f"default-src 'none'; script-src {_hash(library)} {_hash(script)}; "
-    policy += f"style-src {_hash(style)}; base-uri 'none'; form-action 'none'"
+    style, library, script = _assets()
     content = _data(flight, wall_ns)
     data = json.dumps(content, separators=(",", ":"), allow_nan=False)
     packed = gzip.compress(data.encode(), mtime=0)
     parts = {
-        "policy": escape(policy),
+        "policy": escape(policy()),
         "title": escape(source),
         "style": style,
         "head": _head(flight, source, provenance or {}, wall_ns),
@@ -66,6 +63,22 @@ def render(
         "script": script,
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _file("page.html"))
+
+
+def policy() -> str:
+    """Return the Content-Security-Policy of the page, which is the same for every flight."""
+    style, library, script = _assets()
+    return (
+        f"default-src 'none'; script-src {_hash(library)} {_hash(script)}; "
+        f"style-src {_hash(style)}; base-uri 'none'; form-action 'none'"
+    )
+
+
+def _assets() -> tuple[str, str, str]:
+    """Return the page's style, uPlot, and the page's own script."""
+    style = "".join(look.text(name) for name in look.STYLES) + _file("page.css")
+    script = look.text("plots.js") + _file("page.js")
+    return style, look.text("vendor/uPlot.iife.min.js"), script
 
 
 def _file(name: str) -> str:
