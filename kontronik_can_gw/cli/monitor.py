@@ -4,40 +4,21 @@ It never sends anything.
 """
 
 import argparse
-import contextlib
-import socket
 import sys
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from pathlib import Path
 from threading import Event
 from typing import Any
 
-from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
+from kontronik_can_gw.cli.arguments import number_from, option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
-from kontronik_can_gw.cli.desk import bus_layout, given_layout
+from kontronik_can_gw.cli.source import SOURCE_OPTIONS, recording_of, source_of
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.watch import once, stream, watch
-from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
-from kontronik_can_gw.desk.sources import Bus, Recording, Source, can_config
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable_json
 
 _ONCE_S = 3.0
 OPTIONS = (
-    option("SOURCE", "a CAN interface, a recording, or - for standard input", nargs="?"),
-    LAYOUT,
-    option("--interface NAME", "python-can interface (default socketcan)"),
-    option(
-        "--channel NAME",
-        "channel of the interface (default can0), or the channel of a CAN log to play, for "
-        "example can0 or 1",
-    ),
-    option(
-        "--speed FACTOR",
-        "factor that speeds up a recording, 0.01 to 1000 (default 1)",
-        type=number_from(0.01, 1000, "factor"),
-    ),
+    *SOURCE_OPTIONS,
     (
         option("--once", "print one line of JSON with all values, then end"),
         option("--stream", "print one line of JSON each second until the end"),
@@ -81,11 +62,12 @@ usage, or the recording cannot be opened
 
 
 def main(args: argparse.Namespace) -> int:
-    recording = _recording_of(args)
+    recording = recording_of(args)
     if args.timeout is not None and not args.once:
         raise UserError("--timeout: is for --once. Leave it out.")
     stop = Event()
-    with _source_of(args, recording) as source, stopping_on_signals(stop.set):
+    opened = source_of(args, recording, at_once=args.once)
+    with opened as source, stopping_on_signals(stop.set):
         monitor = Monitor(source.bus)
         if args.stream:
             stream(source, monitor, _print_document, stop.is_set)
@@ -105,60 +87,3 @@ def main(args: argparse.Namespace) -> int:
 def _print_document(document: dict[str, Any]) -> None:
     is_utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
     print(printable_json(document, ascii_only=not is_utf8), flush=True)
-
-
-def _recording_of(args: argparse.Namespace) -> Path | None:
-    """Return the recording of SOURCE. If SOURCE is an interface, store it as the channel.
-
-    Raises UserError for options that contradict SOURCE.
-    """
-    name = args.source
-    if name is None or _is_interface(name, args.interface):
-        if args.speed is not None:
-            raise UserError("--speed: is for a recording, not for the bus. Leave it out.")
-        if name is not None and args.channel is not None:
-            raise UserError(f"--channel {args.channel}: {name} names the interface. Leave one out.")
-        args.channel = name or args.channel
-        return None
-    if args.interface is not None:
-        raise UserError(f"{name}: is a recording, so --interface has no effect. Leave it out.")
-    return Path(name)
-
-
-def _is_interface(name: str, kind: str | None) -> bool:
-    """Return True for the name of a CAN interface, False for a recording.
-
-    ``kind`` is python-can's interface, if it is given. The name of a missing interface or file
-    counts as an interface, unless it looks like a file name. The later error describes how to
-    create the interface.
-    """
-    if kind not in (None, "socketcan"):
-        return not Path(name).is_file()
-    if "/" in name or name == "-":
-        return False
-    with contextlib.suppress(OSError):
-        socket.if_nametoindex(name)
-        return True
-    return "." not in name and not Path(name).exists()
-
-
-@contextmanager
-def _source_of(args: argparse.Namespace, recording: Path | None) -> Iterator[Source]:
-    if recording is None:
-        bus = bus_layout(args)
-        with Bus(bus, can_config(bus, args.interface, args.channel)) as live:
-            yield live
-        return
-    given = given_layout(args)
-    with open_input(recording, given) as opened:
-        if given is not None and isinstance(opened, CaptureInput):
-            raise UserError(
-                f"{recording}: is a capture, which contains its own DBC. Leave -c and --dbc out."
-            )
-        if args.channel is not None:
-            opened.select_channel(args.channel)
-        with closing(Recording(opened, args.speed or 1.0, at_once=args.once)) as played:
-            yield played
-        lines = [*opened.damage, *opened.clock_notes, opened.left_out]
-        for line in dict.fromkeys(filter(None, lines)):
-            say(f"warning: {line}")

@@ -19,6 +19,7 @@ from command_line import Done, refused, run, written
 from simulated_bus import START_S, Clock, flight, layout_of, write_log
 
 from kontronik_can_gw.cli import monitor
+from kontronik_can_gw.cli import source as source_of_commands
 from kontronik_can_gw.config.keys import CanConfig, shipped
 from kontronik_can_gw.desk import member, sources
 from kontronik_can_gw.desk.monitor import model, screen, watch
@@ -262,11 +263,11 @@ def test_a_name_may_be_an_interface_or_a_recording(
     monkeypatch.chdir(tmp_path)
     opened: list[str] = []
 
-    def open_bus(_bus: object, config: CanConfig) -> None:
+    def open_bus(_bus: object, config: CanConfig, _patient: bool) -> None:
         opened.append(config.channel)
         raise RunError("not opened")
 
-    monkeypatch.setattr(monitor, "Bus", open_bus)
+    monkeypatch.setattr(source_of_commands, "Bus", open_bus)
     done = run("monitor", name, "--once", *words)
     if channel is None:
         assert opened == []
@@ -287,7 +288,9 @@ def test_the_interface_of_the_command_line_overrides_the_configuration(
 ) -> None:
     toml = written(tmp_path / "g.toml", '[can]\nchannel = "can3"\n[[esc]]\nport = "x"\n')
     opened: list[str] = []
-    monkeypatch.setattr(monitor, "Bus", lambda _bus, config: opened.append(config.channel))
+    monkeypatch.setattr(
+        source_of_commands, "Bus", lambda _bus, config, _patient: opened.append(config.channel)
+    )
     for words in (("vcan7",), ()):
         with pytest.raises(TypeError, match="context manager"):
             run("monitor", *words, "-c", toml)
