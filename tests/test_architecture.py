@@ -62,6 +62,9 @@ ONLY_IN = {
     "pyarrow": ("desk",),
     "asammdf": ("desk",),
     "paho": ("desk",),
+    "starlette": ("desk/live/",),
+    "uvicorn": ("desk/live/",),
+    "segno": ("cli",),
     "shtab": ("cli",),
 }
 MODULES = sorted(PACKAGE.rglob("*.py"))

@@ -2,14 +2,20 @@
 
 import argparse
 import math
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from threading import Event
 
 from kontronik_can_gw.cli.arguments import number_from, option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
+from kontronik_can_gw.cli.web import PORT
+from kontronik_can_gw.desk.libraries import EXTRAS, install_command
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.watch import watch
 from kontronik_can_gw.desk.sources import DemoBus
+from kontronik_can_gw.errors import RunError
 
 OPTIONS = (
     option(
@@ -33,7 +39,34 @@ def main(args: argparse.Namespace) -> int:
     bus = DemoBus(args.seed)
     monitor = Monitor(bus.bus)
     say("the ESC and its faults are simulated; the gateway and the monitor are the real ones")
-    with stopping_on_signals(stop.set):
+    with stopping_on_signals(stop.set), _page_of(bus):
         watch(bus, monitor, lambda: stop.is_set() or time.monotonic() >= end)
     say(f"{monitor.view.frames} CAN frames of a simulated ESC decoded")
     return 0
+
+
+@contextmanager
+def _page_of(bus: DemoBus) -> Iterator[None]:
+    """Serve the live page of the simulation beside the screen, if its libraries are installed."""
+    try:
+        from kontronik_can_gw.desk.live import server
+        from kontronik_can_gw.desk.live.content import Content
+    except ImportError:
+        say(f"for the page in a browser: {install_command(EXTRAS['web'])}")
+        yield
+        return
+    try:
+        sock = server.listen("127.0.0.1", PORT)
+    except RunError:  # another page runs
+        sock = server.listen("127.0.0.1", 0)
+    address = f"http://127.0.0.1:{sock.getsockname()[1]}/"
+    say(f"{address} shows the same in a browser")
+    hub = server.Hub(Content(bus))
+    bus.listeners.append(hub)
+    bus.simulation += f", {address}"
+    page = server.LiveServer(hub, sock, None)
+    thread = threading.Thread(target=page.serve, daemon=True)
+    thread.start()
+    yield
+    page.stop()
+    thread.join(2)

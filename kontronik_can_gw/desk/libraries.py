@@ -14,8 +14,9 @@ EXTRAS = {
     "parquet": "pyarrow>=15",
     "mqtt": "paho-mqtt>=2",
     "metrics": "prometheus-client>=0.20",
+    "web": "starlette>=0.40 uvicorn>=0.30 segno>=1.6",
 }
-"""The library of each extra in pyproject.toml."""
+"""The libraries of each extra in pyproject.toml, separated by spaces."""
 
 
 def missing_library(purpose: str, extra: str) -> RunError:
@@ -42,9 +43,10 @@ def install_command(requirement: str) -> str:
 
 
 def _command(option: str, requirement: str) -> str:
+    quoted = " ".join(f"'{each}'" for each in requirement.split())
     if _is_in_pipx():
-        return f"pipx inject --force kontronik-can-gw '{requirement}'"
-    return f"{sys.executable} -m pip install {option} '{requirement}'"
+        return f"pipx inject --force kontronik-can-gw {quoted}"
+    return f"{sys.executable} -m pip install {option} {quoted}"
 
 
 def _is_in_pipx() -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from threading import Thread
-from typing import Self
+from typing import Protocol, Self
 
 from kontronik_can_gw.assembly.assemble import assemble, check_devices
 from kontronik_can_gw.capture.replay import TimedFrame
@@ -265,6 +265,14 @@ _DEMO_STEP_S = 0.005
 """Time between two steps of the simulated gateway."""
 
 
+class Listener(Protocol):
+    """Gets frames, and is called again and again."""
+
+    def take(self, frame: CanFrame, now: int) -> None: ...
+
+    def tick(self) -> float: ...
+
+
 class DemoBus(Source):
     """A simulated bus on which a gateway repeatedly sends the telemetry of one flight."""
 
@@ -274,6 +282,8 @@ class DemoBus(Source):
         esc = {"port": "simulated", "pole_pairs": 7, "gear": 9.8}
         made = assemble(parse({"esc": [esc]}, "demo"))
         assert made.database is not None
+        self.listeners: list[Listener] = []
+        """Get all frames, besides the caller of ``pump``."""
         super().__init__("demo", BusLayout(made.database, made.layout, made.escs, made.config))
         now = time.monotonic_ns()
         self._esc = _flight(seed, now)
@@ -291,6 +301,10 @@ class DemoBus(Source):
             gateway.advance(now)
             for frame in gateway.take_frames(now):
                 take(frame, now)
+                for listener in self.listeners:
+                    listener.take(frame, now)
+            for listener in self.listeners:
+                listener.tick()
             if time.monotonic() >= until_s:
                 return
             time.sleep(_DEMO_STEP_S)

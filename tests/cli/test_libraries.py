@@ -25,7 +25,7 @@ def test_each_extra_has_the_library_of_pyproject() -> None:
     extras = project["optional-dependencies"]
     del extras["all"]
     del extras["test"]
-    assert {extra: [library] for extra, library in EXTRAS.items()} == extras
+    assert {extra: libraries.split() for extra, libraries in EXTRAS.items()} == extras
 
 
 @pytest.mark.parametrize(

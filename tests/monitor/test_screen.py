@@ -131,8 +131,8 @@ def test_a_sparkline_shows_seconds_between_the_extremes_and_gaps() -> None:
     (esc,) = Monitor(bus_of(1)).escs
     track = esc.tracks["battery_voltage"]
     track.history.extend([0.0, 20.0, None, 24.0, 22.0])
-    track.add(20.0)
-    track.add(24.0)
+    track.add(20.0, 0)
+    track.add(24.0, 0)
     quantity = quantity_of("battery_voltage")
     assert plain(sparkline(esc, quantity, 4)) in (["▁ █▄"], ["▁ █▅"])
     assert plain(sparkline(esc, quantity, 0)) == [""]

@@ -4,7 +4,6 @@ Without FOLDER it writes the pictures of the pages into docs/pictures. With FOLD
 kinds of pictures there. `make pictures` runs it with the right path of modules.
 """
 
-import base64
 import io
 import re
 import sys
@@ -25,7 +24,7 @@ from kontronik_can_gw.esc.kontronik.states import OperatingError
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 SIZES = ((80, 24), (120, 40))
-VIEWS = {
+VIEWS: dict[str, tuple[int, int, Any]] = {
     "desktop": (1280, 900, {}),
     "dark": (1280, 900, {"dark": True}),
     "phone": (390, 844, {"phone": True}),
@@ -82,8 +81,7 @@ def reports(folder: Path) -> None:
         with Browser(Path(scratch, "profile")) as browser:
             for name, (width, height, how) in VIEWS.items():
                 browser.open(page, width, height, **how)
-                shot = browser.call("Page.captureScreenshot", format="png")["data"]
-                (folder / f"report_{name}.png").write_bytes(base64.b64decode(shot))
+                browser.picture(folder / f"report_{name}.png")
 
 
 def main(folder: Path) -> None:

@@ -3,6 +3,7 @@
 So the tests need neither a driver, nor a port, nor a library.
 """
 
+import base64
 import json
 import os
 import select
@@ -120,13 +121,17 @@ class Browser:
 
     def open(
         self,
-        page: Path,
+        page: Path | str,
         width: int = 1280,
         height: int = 900,
         dark: bool = False,
         phone: bool = False,
+        ready: str = "'flight' in window",
     ) -> None:
-        """Show a file in a window of this size, and wait until it is loaded and drawn."""
+        """Show a file or an address in a window of this size.
+
+        Waits until it is loaded, the expression ``ready`` is true, and it is drawn.
+        """
         size = {"width": width, "height": height, "deviceScaleFactor": 1 + phone, "mobile": phone}
         self.call("Emulation.setDeviceMetricsOverride", **size)
         self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
@@ -135,10 +140,10 @@ class Browser:
         self.errors.clear()
         self.requests.clear()
         self._loaded = False
-        self.call("Page.navigate", url=page.resolve().as_uri())
+        self.call("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         while not self._loaded:
             self._receive()
-        while not self.run("'flight' in window"):
+        while not self.run(ready):
             self.settle()
         self.settle()
 
@@ -157,6 +162,11 @@ class Browser:
         )
         assert "exceptionDetails" not in found, found["exceptionDetails"].get("exception", found)
         return found["result"].get("value")
+
+    def picture(self, file: Path) -> None:
+        """Write a picture of the window as PNG."""
+        shot = self.call("Page.captureScreenshot", format="png")
+        file.write_bytes(base64.b64decode(shot["data"]))
 
     def mouse(
         self,

@@ -297,3 +297,11 @@ function timePlots(data, whole, showNow) {
     setTheme, fit, range: () => range, cursorTime: () => cursorTime,
   };
 }
+
+// Calls `setDark` for the theme of the system and after each press of the button #theme.
+function startTheme(setDark) {
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  setDark(system.matches);
+  system.addEventListener("change", () => setDark(system.matches));
+  byId("theme").addEventListener("click", () => setDark(!root.classList.contains("dark")));
+}

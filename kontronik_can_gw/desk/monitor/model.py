@@ -4,6 +4,7 @@ All values are read from CAN frames. Pure: no I/O, no clock.
 """
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.dbc.view import View
@@ -83,9 +84,15 @@ class Track:
     def __init__(self) -> None:
         self.low: float | None = None
         self.high: float | None = None
+        self.last: float | None = None
+        """The newest value, also after it has expired."""
+        self.last_ns = 0
+        """The time at which ``last`` was received."""
         self.history: deque[float | None] = deque(maxlen=HISTORY_S)
 
-    def add(self, value: float) -> None:
+    def add(self, value: float, now: int) -> None:
+        self.last = value
+        self.last_ns = now
         if self.low is None or value < self.low:
             self.low = value
         if self.high is None or value > self.high:
@@ -148,7 +155,8 @@ class Esc(Member):
 class Monitor:
     """The gateway and the ESCs of a layout. Times are in ns on the clock of the frames."""
 
-    def __init__(self, bus: BusLayout) -> None:
+    def __init__(self, bus: BusLayout, make_track: Callable[[], Track] = Track) -> None:
+        self._make_track = make_track
         self.file = bus.layout.file.rpartition("/")[2]
         """Name of the DBC in use."""
         self.view = View(SignalReader(bus.layout))
@@ -189,7 +197,7 @@ class Monitor:
                 esc, source = self._tracked[column]
                 value = esc.converted(source, raw)
                 if isinstance(value, (int, float)):
-                    esc.tracks[source].add(value)
+                    esc.tracks[source].add(value, now)
 
     def advance(self, now: int) -> int:
         """Set the time and expire the values of missing messages.
@@ -221,7 +229,7 @@ class Monitor:
         self._tracked: dict[int, tuple[Esc, str]] = {}
         """ESC and source of each column that has a track."""
         for esc in self.escs:
-            esc.tracks = {quantity.source: Track() for quantity in QUANTITIES}
+            esc.tracks = {quantity.source: self._make_track() for quantity in QUANTITIES}
             for source in esc.tracks:
                 if esc.has(source):
                     self._tracked[esc.columns[source]] = (esc, source)

@@ -175,10 +175,7 @@
 
   // --- light and dark, width, print
 
-  const system = matchMedia("(prefers-color-scheme: dark)");
-  setTheme(system.matches);
-  system.addEventListener("change", () => setTheme(system.matches));
-  byId("theme").addEventListener("click", () => setTheme(!root.classList.contains("dark")));
+  startTheme(setTheme);
   addBand();
   data.plots.forEach(addLines);
   listEvents();

@@ -1,0 +1,62 @@
+"""The errors and warnings of all ESCs since the start, with begin and end. Pure."""
+
+from collections import deque
+from collections.abc import Container, Iterable
+from typing import Any
+
+from kontronik_can_gw.desk.member import Alarm
+from kontronik_can_gw.desk.report.events import EventKind, FlightEvent
+from kontronik_can_gw.times import SECOND
+
+_KEPT = 100
+"""Number of ended alarms that are kept."""
+_LOST = "its end is not known"
+
+
+class AlarmLog:
+    """Present and past alarms."""
+
+    def __init__(self) -> None:
+        self._open: dict[tuple[int, str], FlightEvent] = {}
+        """The present alarms by ESC and name."""
+        self._ended: deque[FlightEvent] = deque(maxlen=_KEPT)
+
+    def update(
+        self, esc: int, alarms: Iterable[Alarm], unknown: Container[EventKind], now: int
+    ) -> None:
+        """Set the present alarms of an ESC. ``unknown``: kinds that are not available now."""
+        present = {(esc, alarm.text): alarm for alarm in alarms}
+        for key in [key for key in self._open if key[0] == esc and key not in present]:
+            event = self._open.pop(key)
+            event.end_ns = now
+            if event.kind in unknown:
+                event.note = _LOST
+            self._ended.append(event)
+        for key, alarm in present.items():
+            if key not in self._open:
+                kind: EventKind = "link" if alarm.text == "link" else "error"
+                self._open[key] = FlightEvent(
+                    kind, esc, now, "", alarm.severity.value, alarm.remedy
+                )
+            self._open[key].text = alarm.meaning  # it may contain a duration
+
+    def document(self, now: int) -> list[dict[str, Any]]:
+        """Return all alarms, newest first. ``from`` and ``to`` are seconds before ``now``."""
+        events = sorted(
+            [*self._open.values(), *self._ended], key=lambda event: event.begin_ns, reverse=True
+        )
+        found = []
+        for event in events:
+            end_ns = event.end_ns
+            found.append(
+                {
+                    "esc": event.esc,
+                    "text": event.text,
+                    "severity": event.severity,
+                    "remedy": event.remedy,
+                    "note": event.note,
+                    "from": round((event.begin_ns - now) / SECOND, 1),
+                    "to": None if end_ns is None else round((end_ns - now) / SECOND, 1),
+                }
+            )
+        return found

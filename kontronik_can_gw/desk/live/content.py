@@ -1,0 +1,305 @@
+"""The content of the live page: figures, alarms and plots, as JSON for browsers.
+
+There are three kinds of messages. ``layout`` has everything that does not change. ``update`` has
+the present figures and alarms. A ``step`` has the extremes of one second of all plotted lines.
+"""
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+from kontronik_can_gw import __version__
+from kontronik_can_gw.desk.live.alarms import AlarmLog
+from kontronik_can_gw.desk.member import alarms_of
+from kontronik_can_gw.desk.monitor.model import QUANTITIES, Esc, Monitor, Quantity, Track
+from kontronik_can_gw.desk.monitor.notices import link_of, notices, trouble_of
+from kontronik_can_gw.desk.report.events import EventKind
+from kontronik_can_gw.desk.report.quantities import PLOTS
+from kontronik_can_gw.desk.sources import Source
+from kontronik_can_gw.desk.words import words
+from kontronik_can_gw.esc.value_names import normalize
+from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.times import SECOND
+
+STEPS = 300
+"""Number of steps, one a second, that the plots show."""
+_SILENT_NS = SECOND
+"""After this time without a frame the page says that no gateway is heard."""
+_LARGE = (
+    "motor_speed",
+    "output_speed",
+    "electrical_speed",
+    "battery_voltage",
+    "battery_current",
+    "battery_power",
+    "energy_used",
+    "power_stage_temperature",
+    "bec_temperature",
+)
+"""The values in large figures. Of the speeds only the first one that the DBC has."""
+_PLOTTED = ("battery_voltage", "current", "power", "speed", "temperature")
+"""Keys of the report's plots that the page has."""
+_LEFT_OUT = ("motor_current", "peak_current")
+"""Lines of these plots that the page leaves out, because they would hide the first one."""
+_MARKS = {"": "", "!": "warning", "!!": "error"}
+
+
+class StepTrack(Track):
+    """A track that also has the extremes since the last step of the plots."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._step_low: float | None = None
+        self._step_high: float | None = None
+        self._is_rising = True
+        """True if the highest value of the step came after the lowest one."""
+
+    def add(self, value: float, now: int) -> None:
+        super().add(value, now)
+        if self._step_low is None or value < self._step_low:
+            self._step_low = value
+            self._is_rising = False
+        if self._step_high is None or value > self._step_high:
+            self._step_high = value
+            self._is_rising = True
+
+    def take_step(self, value: float | None) -> tuple[float | None, float | None]:
+        """Return the extremes since the last call in the order of their times.
+
+        Without a new value they are the present ``value``.
+        """
+        first, second = self._step_low, self._step_high
+        if first is None:
+            first = second = value
+        elif not self._is_rising:
+            first, second = second, first
+        self._step_low = None
+        self._step_high = None
+        return first, second
+
+    def restart_extremes(self) -> None:
+        """Let minimum and maximum begin again."""
+        self.low = None
+        self.high = None
+
+
+class Content:
+    """The data of the live page. Fed with frames and time by one thread."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.monitor = Monitor(source.bus, StepTrack)
+        self.disk = ""
+        """A line about the disk of the captures if its space is short."""
+        self._alarms = AlarmLog()
+        self._step_ns: int | None = None
+        """Begin of the present step."""
+        escs = self.monitor.escs
+        speeds = [each for each in QUANTITIES if each.unit == "1/min" and _has(each, escs)]
+        hidden = {each.source for each in speeds[1:]}
+        self._large = [source for source in _LARGE if source not in hidden]
+        quantities = [each for each in QUANTITIES if _has(each, escs)]
+        self._quantities = sorted(quantities, key=lambda each: _rank(self._large, each.source))
+        self._plots = list(self._make_plots(hidden))
+        self._lines: list[tuple[Esc, Quantity]] = []
+        """The lines of all plots, in the order of a step's values."""
+        by_source = {quantity.source: quantity for quantity in QUANTITIES}
+        for plot in self._plots:
+            for series in plot["series"]:
+                esc = self.monitor.escs[series["esc"]]
+                self._lines.append((esc, by_source[plot["sources"][series["line"]]]))
+
+    def _make_plots(self, hidden: set[str]) -> Iterator[dict[str, Any]]:
+        for plot in PLOTS:
+            if plot.key not in _PLOTTED:
+                continue
+            lines = {}
+            for source, label in plot.lines.items():
+                is_known = any(esc.has(source) for esc in self.monitor.escs)
+                if is_known and source not in hidden and source not in _LEFT_OUT:
+                    lines[source] = label
+            series = []
+            for line, source in enumerate(lines):
+                for esc in self.monitor.escs:
+                    if esc.has(source):
+                        series.append({"esc": esc.index, "line": line, "drawn": True})
+            if not series:
+                continue
+            unit = next(each.unit for each in QUANTITIES if each.source in lines)
+            yield {
+                "key": plot.key,
+                "title": plot.title,
+                "note": "",
+                "unit": unit,
+                "digits": plot.digits,
+                "lines": list(lines.values()),
+                "sources": list(lines),
+                "series": series,
+            }
+
+    def take(self, frame: CanFrame, now: int) -> None:
+        """Evaluate a frame that was received at ``now``."""
+        self.monitor.take(frame, now)
+
+    def steps(self, now: int) -> list[str]:
+        """Set the time, and return the steps that have ended. Usually one or none."""
+        now = self.monitor.advance(now)
+        for index, esc in enumerate(self.monitor.escs):
+            flags = list(esc.active)
+            trouble = trouble_of(esc)
+            if trouble is not None:
+                flags.insert(0, trouble)
+            unknown: list[EventKind] = []
+            if all(esc.flags(word) is None for word in esc.protocol.errors):
+                unknown.append("error")
+            if esc.link is None:
+                unknown.append("link")
+            self._alarms.update(index, alarms_of(flags), unknown, now)
+        if self._step_ns is None:
+            self._step_ns = now
+        count = (now - self._step_ns) // SECOND
+        if not count:
+            return []
+        self._step_ns += count * SECOND
+        values: list[float | None] = []
+        for esc, quantity in self._lines:
+            track = esc.tracks[quantity.source]
+            assert isinstance(track, StepTrack)
+            for value in track.take_step(esc.number(quantity.source)):
+                values.append(None if value is None else round(value, quantity.digits + 1))
+        missed = min(count - 1, STEPS)
+        return [_json([None] * len(values))] * missed + [_json(values)]
+
+    def restart_extremes(self) -> None:
+        """Let minimum and maximum of all values begin again."""
+        for esc in self.monitor.escs:
+            for track in esc.tracks.values():
+                assert isinstance(track, StepTrack)
+                track.restart_extremes()
+
+    def layout(self) -> str:
+        """Return everything that does not change."""
+        source = self.source
+        quantities = []
+        for quantity in self._quantities:
+            quantities.append(
+                {
+                    "source": quantity.source,
+                    "label": quantity.label,
+                    "unit": quantity.unit,
+                    "digits": quantity.digits,
+                    "isLarge": quantity.source in self._large,
+                    "isUpper": quantity.unit != "V",
+                    "has": [esc.has(quantity.source) for esc in self.monitor.escs],
+                }
+            )
+        return _json(
+            {
+                "version": __version__,
+                "name": source.name,
+                "file": self.monitor.file,
+                "kind": "recording" if source.is_file else "bus",
+                "simulation": source.simulation,
+                "escs": [esc.name for esc in self.monitor.escs],
+                "quantities": quantities,
+                "plots": self._plots,
+                "stepCount": STEPS,
+            }
+        )
+
+    def update(self, now: int, sent_s: float) -> str:
+        """Return the present figures and alarms, and the state of gateway and bus.
+
+        ``sent_s`` is the time on a clock that always runs, by which a page finds late updates.
+        """
+        monitor = self.monitor
+        told = [(kind.value, text) for text, kind in notices(monitor, self.source)]
+        if self.disk:
+            told.append(("hint", self.disk))
+        return _json(
+            {
+                "time": round(sent_s, 3),
+                "notices": told,
+                "state": self._state(),
+                "progress": self.source.progress,
+                "escs": [self._esc(esc, now) for esc in monitor.escs],
+                "alarms": self._alarms.document(now),
+            }
+        )
+
+    def _state(self) -> tuple[str, str]:
+        """Return the state of gateway and bus in one line, and its severity."""
+        monitor = self.monitor
+        if self.source.problem:
+            return "error", "no connection to the CAN bus"
+        if monitor.silent_ns >= _SILENT_NS and not self.source.is_file:
+            return "error", f"no gateway heard for {monitor.silent_ns // SECOND} s"
+        gateway = monitor.gateway.text("gateway_state")
+        can = monitor.gateway.text("can_state")
+        severity = "ok"
+        parts = []
+        if gateway is not None:
+            parts.append(f"gateway {words(gateway)}")
+            if normalize(gateway) != "running":
+                severity = "warning"
+        if can is not None and normalize(can) != "unknown":
+            parts.append(f"CAN {words(can)}")
+            if normalize(can) != "erroractive":
+                severity = "warning"
+        if monitor.frame_rate is not None:
+            parts.append(f"{monitor.frame_rate:.0f} frames/s")
+        return severity, ", ".join(parts) or "waiting for frames"
+
+    def _esc(self, esc: Esc, now: int) -> dict[str, Any]:
+        link, text = link_of(esc)
+        device = esc.device_text
+        cells = esc.number("cell_count")
+        if cells:
+            device += f", {cells:.0f} cells"
+        return {
+            "state": "-" if esc.state is None else words(esc.state),
+            "link": text,
+            "isGood": link == "ok",
+            "device": device,
+            "values": [self._value(esc, quantity, now) for quantity in self._quantities],
+        }
+
+    def _value(self, esc: Esc, quantity: Quantity, now: int) -> tuple[Any, ...] | None:
+        """Return value, age if it is not available, minimum, maximum and severity of its mark.
+
+        The age is in seconds, and the value then is the last known one. None if the ESC does not
+        have the quantity or if it was not received yet.
+        """
+        track = esc.tracks[quantity.source]
+        value = esc.number(quantity.source)
+        digits = quantity.digits
+        if value is not None:
+            mark = _MARKS[quantity.mark(value)]
+            return (
+                round(value, digits),
+                None,
+                _round(track.low, digits),
+                _round(track.high, digits),
+                mark,
+            )
+        if track.last is None:
+            return None
+        age_s = round((now - track.last_ns) / SECOND, 1)
+        low = _round(track.low, digits)
+        return round(track.last, digits), age_s, low, _round(track.high, digits), ""
+
+
+def _has(quantity: Quantity, escs: tuple[Esc, ...]) -> bool:
+    return any(esc.has(quantity.source) for esc in escs)
+
+
+def _rank(order: list[str], source: str) -> int:
+    return order.index(source) if source in order else len(order)
+
+
+def _round(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
+
+
+def _json(content: Any) -> str:
+    return json.dumps(content, separators=(",", ":"), allow_nan=False)

@@ -1,0 +1,256 @@
+"""The live page in a real browser (headless Chromium), on a bus that the test feeds."""
+
+import json
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from live_bench import FedBus, Line, ServedPage, wait_until
+from report_browser import MISSING, PROGRAM, Browser
+from simulated_bus import Timed, flight, with_errors
+
+from kontronik_can_gw.esc.kontronik.simulator import EscOptions
+from kontronik_can_gw.esc.kontronik.states import OperatingError
+from kontronik_can_gw.times import SECOND as S
+
+pytestmark = [pytest.mark.extended, pytest.mark.skipif(PROGRAM is None, reason=MISSING)]
+
+READY = "!!(globalThis.live && live.layout() && live.updates > 1)"
+# Return the text and class of each figure of an ESC's card, by source.
+FIGURES = """((esc) => Object.fromEntries(
+  [...document.querySelectorAll('.esc')[esc].querySelectorAll('.figure')].map((node) => [
+    node.dataset.source,
+    [...node.querySelectorAll('.value span, .range'), { textContent: node.className }]
+      .map((part) => part.textContent),
+  ])))"""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("browser") / "profile") as found:
+        yield found
+
+
+@pytest.fixture
+def bus() -> FedBus:
+    return FedBus(["left", "right"])
+
+
+@pytest.fixture
+def page(bus: FedBus) -> Iterator[ServedPage]:
+    with ServedPage(bus) as served:
+        yield served
+
+
+def fly(bus: FedBus, seconds: float, *options: EscOptions, **more: Any) -> Timed:
+    """Feed a flight to the bus. Return its frames."""
+    frames = flight(bus.bus, seconds, list(options), **more)
+    bus.feed(frames, round(seconds * S))
+    return frames
+
+
+def figures(browser: Browser, esc: int = 0) -> dict[str, tuple[str, str, str]]:
+    found: dict[str, tuple[str, str, str]] = browser.run(f"{FIGURES}({esc})")
+    return found
+
+
+def number(text: str) -> float:
+    return float(text.replace("\u202f", "").replace("−", "-"))
+
+
+def wait_for_updates(browser: Browser) -> None:
+    """Wait until the page has shown all data that the bus had before this call."""
+    count = browser.run("live.updates")
+    wait_until(lambda: browser.run("live.updates") > count + 2, "updates")
+
+
+def test_every_figure_equals_the_decoded_frame(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    fly(bus, 20)
+    browser.open(page.url, ready=READY)
+    wait_for_updates(browser)
+    quantities = {each["source"]: each for each in json.loads(page.content.layout())["quantities"]}
+    for index, esc in enumerate(page.content.monitor.escs):
+        shown = figures(browser, index)
+        assert set(shown) == set(quantities)
+        for source, (text, limits, style) in shown.items():
+            real = esc.number(source)
+            track = esc.tracks[source]
+            assert real is not None
+            assert number(text) == round(real, quantities[source]["digits"]), source
+            assert "old" not in style.split()
+            low, _, high = limits.partition(" … ")
+            assert number(low) == round(track.low or 0, quantities[source]["digits"])
+            assert number(high) == round(track.high or 0, quantities[source]["digits"])
+    assert browser.errors == []
+    assert all(address.startswith((page.url, "data:")) for address in browser.requests)
+
+
+def test_a_page_without_messages_never_looks_alive(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    """The connection loses all packets and is not closed."""
+    fly(bus, 5)
+    with Line(page.port) as line:
+        browser.open(line.url, ready=READY)
+        assert browser.run("document.querySelector('#offline').hidden") is True
+        line.is_cut = True
+        heard = browser.run("live.heard()")
+        is_stale = "document.body.classList.contains('stale')"
+        wait_until(lambda: browser.run(is_stale), "a stale page")
+        late = browser.run("performance.now()") - heard
+        assert late >= 1000
+        wait_until(
+            lambda: (
+                "no connection for 2 s"
+                in browser.run("document.querySelector('#offline').textContent")
+            ),
+            "the time without a connection",
+        )
+        spans = "[...document.querySelectorAll('.figure .value span')]"
+        colours = browser.run(f"{spans}.map((node) => getComputedStyle(node).color)")
+        assert len(set(colours)) == 1
+        assert "no connection" in browser.run("document.title")
+        assert "offline" in browser.run("document.querySelector('#icon').href")
+        line.is_cut = False
+        wait_until(lambda: not browser.run(is_stale), "a live page")
+    browser.open("about:blank", ready="true")
+
+
+def test_a_page_continues_after_a_restart_of_the_server(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    fly(bus, 5)
+    browser.open(page.url, ready=READY)
+    page.stop()
+    is_stale = "document.body.classList.contains('stale')"
+    wait_until(lambda: browser.run(is_stale), "a stale page")
+    page.start()
+    wait_until(lambda: not browser.run(is_stale), "a live page")
+    bus.feed(
+        [(now + 5 * S, frame) for now, frame in flight(bus.bus, 3)],
+        8 * S,
+    )
+    wait_for_updates(browser)
+    esc = page.content.monitor.escs[0]
+    real = esc.number("battery_voltage")
+    assert real is not None
+    assert number(figures(browser)["battery_voltage"][0]) == round(real, 2)
+    browser.errors.clear()  # the browser reports each refused connection
+
+
+def test_lost_telemetry_is_grey_with_its_age_and_the_other_esc_goes_on(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    fly(bus, 12, with_errors(OperatingError.UNDERVOLTAGE))
+    browser.open(page.url, ready=READY)
+    wait_for_updates(browser)
+    assert "⚠" in browser.run("document.title")
+    assert "error" in browser.run("document.querySelector('#icon').href")
+    alarm = browser.run("document.querySelector('#alarms li').textContent")
+    assert "left: battery voltage too low" in alarm
+    bus.feed([], 14 * S)
+    wait_until(
+        lambda: (
+            "no gateway heard for 2 s"
+            in browser.run("document.querySelector('#state').textContent")
+        ),
+        "the silence",
+    )
+    wait_for_updates(browser)
+    text, age, style = figures(browser)["battery_voltage"]
+    assert "old" in style.split()
+    assert text != "–"
+    assert age.endswith(" s old")
+
+
+def test_reset_pause_and_zoom(browser: Browser, bus: FedBus, page: ServedPage) -> None:
+    fly(bus, 30)
+    browser.open(page.url, ready=READY)
+    wait_for_updates(browser)
+    assert " … " in figures(browser)["motor_speed"][1]
+    browser.run("document.querySelector('#reset').click()")
+    wait_until(lambda: figures(browser)["motor_speed"][1] == "", "the reset")
+    browser.run("document.querySelector('#pause').click()")
+    newest = "live.view().plots[0].u.data[1].at(-1)"
+    before = browser.run(newest)
+    count = browser.run("live.steps().length")
+    bus.feed([(now + 30 * S, frame) for now, frame in flight(bus.bus, 20)], 50 * S)
+    wait_until(lambda: browser.run("live.steps().length") > count, "steps")
+    assert browser.run(newest) == before
+    browser.run("document.querySelector('#pause').click()")
+    browser.settle()
+    steps = json.loads(browser.run("JSON.stringify(live.steps())"))
+    assert browser.run(newest) == steps[-1][1]
+    browser.run("document.querySelector('#in').click()")
+    assert browser.run("live.view().range()") == [-150, 0]
+    browser.run("document.querySelector('#whole').click()")
+    assert browser.run("live.view().range()") == [-300, 0]
+
+
+def test_a_limit_colours_the_figure_and_sounds_once(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    fly(bus, 10)
+    browser.open(page.url, ready=READY)
+    script = """((value) => {
+      const labels = [...document.querySelectorAll('#limit-list label')];
+      const label = labels.find((l) => /battery voltage below/.test(l.textContent));
+      label.querySelector('input').value = value;
+      label.querySelector('input').dispatchEvent(new Event('change'));
+    })"""
+    browser.run(f"{script}(100)")
+    wait_until(lambda: "beyond" in figures(browser)["battery_voltage"][2].split(), "the colour")
+    assert "beyond" not in figures(browser)["battery_current"][2].split()
+    wait_for_updates(browser)
+    assert browser.run("live.beeps") == 2  # one for each ESC
+    browser.open(page.url, ready=READY)
+    wait_until(lambda: "beyond" in figures(browser)["battery_voltage"][2].split(), "the limit")
+    browser.run(f"{script}('')")
+    wait_until(lambda: "beyond" not in figures(browser)["battery_voltage"][2].split(), "no limit")
+
+
+@pytest.mark.parametrize("count", [1, 2, 8])
+@pytest.mark.parametrize("width", [360, 768, 1440])
+@pytest.mark.parametrize("dark", [False, True])
+def test_nothing_is_cut_off_or_scrolls_sideways(
+    browser: Browser, count: int, width: int, dark: bool
+) -> None:
+    bus = FedBus([f"motor_{number}" for number in range(count)])
+    with ServedPage(bus) as page:
+        fly(bus, 12, with_errors(OperatingError.UNDERVOLTAGE))
+        browser.open(page.url, width, 800, dark=dark, phone=width == 360, ready=READY)
+        wait_for_updates(browser)
+        parts = ".esc *, #alarms *, header *, #bar *"
+        cut = f"""[...document.querySelectorAll('{parts}')].filter((node) =>
+          node.getClientRects().length && node.scrollWidth > node.clientWidth + 1
+          && getComputedStyle(node).display !== 'inline').map((node) => node.outerHTML)"""
+        views = [None] if count == 1 else [None, 0]
+        for view in views:
+            if view is not None:
+                browser.run("document.querySelector('.esc button').click()")
+                browser.settle()
+            assert browser.run("document.documentElement.scrollWidth") == width
+            assert browser.run(cut) == []
+            plots = browser.run("live.view().plots.map((p) => p.u.width)")
+            assert max(plots) <= width
+        assert browser.errors == []
+
+
+def test_one_of_eight_escs_fills_the_screen(browser: Browser) -> None:
+    bus = FedBus([f"m{number}" for number in range(8)])
+    with ServedPage(bus) as page:
+        fly(bus, 5)
+        browser.open(page.url, 360, 780, phone=True, ready=READY)
+        cards = (
+            "[...document.querySelectorAll('.esc')].filter((n) => n.getClientRects().length).length"
+        )
+        assert browser.run(cards) == 8
+        browser.run("document.querySelectorAll('.esc button')[3].click()")
+        assert browser.run(cards) == 1
+        assert browser.run("live.view().visible.indexOf(true)") == 3
+        browser.run("document.querySelector('#back').click()")
+        assert browser.run(cards) == 8
+        assert math.isclose(browser.run("live.view().plots.length"), 5)
