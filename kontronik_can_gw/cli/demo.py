@@ -51,6 +51,7 @@ def _page_of(bus: DemoBus) -> Iterator[None]:
     try:
         from kontronik_can_gw.desk.live import server
         from kontronik_can_gw.desk.live.content import Content
+        from kontronik_can_gw.desk.live.flights import Flights
     except ImportError:
         say(f"for the page in a browser: {install_command(EXTRAS['web'])}")
         yield
@@ -64,7 +65,7 @@ def _page_of(bus: DemoBus) -> Iterator[None]:
     hub = server.Hub(Content(bus))
     bus.listeners.append(hub)
     bus.simulation += f", {address}"
-    page = server.LiveServer(hub, sock, None)
+    page = server.LiveServer(hub, sock, None, Flights())
     thread = threading.Thread(target=page.serve, daemon=True)
     thread.start()
     yield

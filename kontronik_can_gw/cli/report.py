@@ -1,6 +1,7 @@
 """``report``: writes a page about a recorded flight for a browser."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import FORCE, LAYOUT, LOG_CHANNEL, number_from, option
@@ -14,8 +15,8 @@ from kontronik_can_gw.cli.output import (
 )
 from kontronik_can_gw.desk.recordings.inputs import Input
 from kontronik_can_gw.desk.recordings.stream import name_of
-from kontronik_can_gw.desk.report.flight import Flight, needed_columns
 from kontronik_can_gw.desk.report.page import render
+from kontronik_can_gw.desk.report.recorded import flight_of
 from kontronik_can_gw.errors import RunError, UserError
 
 _STOPPED = 130
@@ -80,7 +81,8 @@ def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) 
     Raises RunError if there is nothing to show.
     """
     source = name_of(Path(args.input))
-    flight = _analysed(recording, args)
+    watch = partial(watched, name=f"{recording.name}: rows", data_on_screen=args.output == "-")
+    flight = flight_of(recording, (args.start, args.end), watch)
     damage = [f"{source}: damaged: {line}" for line in recording.damage]
     if not flight.rows:
         if was_ended(recording):
@@ -104,19 +106,3 @@ def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) 
     damage += [f"{source}: {note}" for note in recording.clock_notes]
     for line in damage:
         say(line, "report")
-
-
-def _analysed(recording: Input, args: argparse.Namespace) -> Flight:
-    """Return the flight after all rows. Raises UserError if nothing can be shown."""
-    chosen = needed_columns(recording.fields)
-    fields = [recording.fields[index] for index in chosen]
-    flight = Flight(recording.bus.escs, fields, window=(args.start, args.end))
-    if not flight.has_anything:
-        raise UserError(
-            f"{recording.bus.layout.file}: has no signal that a report shows. Give another --dbc."
-        )
-    blocks = filter(len, recording.blocks(chosen))
-    for block in watched(blocks, f"{recording.name}: rows", args.output == "-"):
-        if not flight.evaluate(block):
-            break
-    return flight.finish()

@@ -14,6 +14,7 @@ from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.recording import record_folder
 from kontronik_can_gw.cli.source import SOURCE_OPTIONS, recording_of, source_of
+from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.errors import RunError
@@ -89,6 +90,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         from kontronik_can_gw.desk.live import access, server
         from kontronik_can_gw.desk.live.content import Content
+        from kontronik_can_gw.desk.live.flights import Flights
     except ImportError:
         raise missing_library("web", "web") from None
     if args.address:
@@ -101,8 +103,9 @@ def main(args: argparse.Namespace) -> int:
         sock = server.listen(host, port)
         cache = access.cache_folder(args.cache)
         address = access.Address.stored(cache, host, sock.getsockname()[1], is_open)
-        hub = server.Hub(Content(source))
-        page = server.LiveServer(hub, sock, None if is_open else address.token)
+        flights = Flights(*_captures_of(args, source), cache)
+        hub = server.Hub(Content(source, lambda: flights.disk))
+        page = server.LiveServer(hub, sock, None if is_open else address.token, flights)
         thread = threading.Thread(
             target=server.feed, args=(source, hub, stopped.is_set), daemon=True
         )
@@ -162,10 +165,11 @@ def _print_code(address: "Address", stream: TextIO) -> None:
     segno.make(address.urls()[0], micro=False).terminal(out=stream, compact=True)
 
 
-def captures_of(args: argparse.Namespace, source: Source) -> Path | None:
-    """Return the folder of captures. None if there is none."""
-    if args.captures is not None:
-        return args.captures  # type: ignore[no-any-return]
-    if source.bus.config is None or source.is_file:
-        return None
-    return record_folder(source.bus.config)
+def _captures_of(args: argparse.Namespace, source: Source) -> tuple[Path | None, int]:
+    """Return the folder of captures, or None, and the free space that a recorder leaves."""
+    config = None if source.is_file else source.bus.config
+    record = RecordConfig() if config is None else config.record
+    folder = args.captures
+    if folder is None and config is not None:
+        folder = record_folder(config)
+    return folder, record.min_free_mb * 1_000_000

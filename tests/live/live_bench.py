@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 from simulated_bus import Timed, layout_of
-from starlette.routing import BaseRoute
 
 from kontronik_can_gw.desk.live.content import Content
+from kontronik_can_gw.desk.live.flights import Flights
 from kontronik_can_gw.desk.live.server import Hub, LiveServer, feed, listen
 from kontronik_can_gw.desk.sources import Source, Take
 from kontronik_can_gw.frames import CanFrame
@@ -56,11 +56,11 @@ class ServedPage:
         self,
         source: Source,
         token: str | None = None,
-        further: Sequence[BaseRoute] = (),
+        flights: Flights | None = None,
     ) -> None:
         self.source = source
         self._token = token
-        self._further = further
+        self._flights = flights or Flights()
         self.port = 0
         self.start()
 
@@ -69,7 +69,7 @@ class ServedPage:
         self.hub = Hub(self.content)
         sock = listen("127.0.0.1", self.port)
         self.port = sock.getsockname()[1]
-        self._server = LiveServer(self.hub, sock, self._token, self._further)
+        self._server = LiveServer(self.hub, sock, self._token, self._flights)
         self._is_stopped = threading.Event()
         arguments = (self.source, self.hub, self._is_stopped.is_set)
         self._threads = [

@@ -5,7 +5,7 @@ the present figures and alarms. A ``step`` has the extremes of one second of all
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from kontronik_can_gw import __version__
@@ -86,11 +86,11 @@ class StepTrack(Track):
 class Content:
     """The data of the live page. Fed with frames and time by one thread."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, disk: Callable[[], str] = str) -> None:
+        """``disk`` returns a line about the disk of the captures if its space is short, or ""."""
         self.source = source
+        self._disk = disk
         self.monitor = Monitor(source.bus, StepTrack)
-        self.disk = ""
-        """A line about the disk of the captures if its space is short."""
         self._alarms = AlarmLog()
         self._step_ns: int | None = None
         """Begin of the present step."""
@@ -214,8 +214,8 @@ class Content:
         """
         monitor = self.monitor
         told = [(kind.value, text) for text, kind in notices(monitor, self.source)]
-        if self.disk:
-            told.append(("hint", self.disk))
+        if disk := self._disk():
+            told.append(("hint", disk))
         return _json(
             {
                 "time": round(sent_s, 3),

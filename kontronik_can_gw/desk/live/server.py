@@ -24,6 +24,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from kontronik_can_gw.desk import look
 from kontronik_can_gw.desk.live.access import Gate, is_command, own_names
 from kontronik_can_gw.desk.live.content import STEPS, Content
+from kontronik_can_gw.desk.live.flights import Flights
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
@@ -162,8 +163,8 @@ def _files() -> dict[str, tuple[bytes, str]]:
     return found
 
 
-def application(hub: Hub, further: Sequence[BaseRoute] = ()) -> Starlette:
-    """Return the application with the live page, its events and ``further`` routes."""
+def application(hub: Hub, flights: Flights) -> Starlette:
+    """Return the application with the live page and the flights."""
     files = _files()
 
     def static(name: str) -> Response:
@@ -175,7 +176,7 @@ def application(hub: Hub, further: Sequence[BaseRoute] = ()) -> Starlette:
     async def page(_: Request) -> Response:
         return static("live.html")
 
-    async def flights(_: Request) -> Response:
+    async def list_page(_: Request) -> Response:
         return static("flights.html")
 
     async def asset(request: Request) -> Response:
@@ -198,12 +199,12 @@ def application(hub: Hub, further: Sequence[BaseRoute] = ()) -> Starlette:
 
     routes: list[BaseRoute] = [
         Route("/", page),
-        Route("/flights", flights),
+        Route("/flights", list_page),
         Route("/static/{name}", asset),
         Route("/events", events),
         Route("/reset", reset),
     ]
-    return Starlette(routes=[*routes, *further])
+    return Starlette(routes=[*routes, *flights.routes()])
 
 
 # --- connections
@@ -292,13 +293,12 @@ class LiveServer:
         hub: Hub,
         sock: socket.socket,
         token: str | None,
-        further: Sequence[BaseRoute] = (),
-        starting: Callable[[], contextlib.AbstractAsyncContextManager[Any]] | None = None,
+        flights: Flights,
     ) -> None:
         self._hub = hub
         self._sock = sock
-        self._starting = starting
-        app = Gate(application(hub, further), token, sock.getsockname()[1], own_names())
+        self._flights = flights
+        app = Gate(application(hub, flights), token, sock.getsockname()[1], own_names())
         self._server = Server(
             uvicorn.Config(
                 app,
@@ -326,9 +326,7 @@ class LiveServer:
 
     async def _serve(self) -> None:
         self._hub.attach()
-        async with contextlib.AsyncExitStack() as stack:
-            if self._starting is not None:
-                await stack.enter_async_context(self._starting())
+        async with self._flights.running():
             watch = asyncio.create_task(self._close_streams())
             await self._server.serve([self._sock])
             watch.cancel()

@@ -1,0 +1,411 @@
+"""The recordings in the folder of captures, and the files that are made from them.
+
+A summary, report or table is made by a child process with low priority and limits, one at a time.
+It is kept in the cache folder until its capture changes. Requests name a recording by an id from
+the list, never by a path.
+"""
+
+import asyncio
+import contextlib
+import hashlib
+import importlib.util
+import json
+import os
+import re
+import resource
+import sys
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route
+
+from kontronik_can_gw import __version__
+from kontronik_can_gw.capture.format import SUFFIX
+from kontronik_can_gw.desk.live.access import is_command
+from kontronik_can_gw.desk.report.page import policy
+from kontronik_can_gw.runtime.files.disk import is_locked
+from kontronik_can_gw.times import SECOND
+
+_PACKAGE = "kontronik_can_gw"
+_SUMMARY = "summary"
+_COMMANDS = {
+    _SUMMARY: (f"{_PACKAGE}.desk.live.summary", "{source}", "{output}"),
+    "report": (_PACKAGE, "report", "{source}", "-o", "{output}", "--force"),
+    "csv": (_PACKAGE, "convert", "{source}", "{output}", "--force"),
+    "parquet": (_PACKAGE, "convert", "{source}", "{output}", "--force"),
+}
+"""Module and arguments of the child process for each kind of file."""
+_ENDINGS = {_SUMMARY: "json", "report": "html", "csv": "csv", "parquet": "parquet"}
+_PART = re.compile(r"(.+)-[0-9]+")
+"""Name of a part of a run without its suffix."""
+_LIMIT_S = 1800
+"""Longest time that a child process may take."""
+_LIMIT_BYTES = 768 << 20
+"""Most memory that a child process may allocate."""
+_CACHE_BYTES = 512 << 20
+"""Most memory on the disk that made files may have. The oldest are removed."""
+_POLL_S = 0.5
+_LOOKED_AT_S = 10.0
+"""Summaries are made until this time after the last request for the list."""
+_DISK_S = 10.0
+_WRITTEN_S = 300
+"""A capture that was not changed for this time is not being written."""
+_NICE = 19
+_OOM_ADJUSTMENT = "900"
+
+
+class Recording(NamedTuple):
+    """The captures of one run."""
+
+    name: str
+    paths: tuple[Path, ...]
+    size: int
+    changed_ns: int
+
+    @property
+    def id(self) -> str:
+        return _digest(self.name)
+
+    @property
+    def is_written(self) -> bool:
+        """True while a gateway writes the last capture."""
+        is_new = time.time() - self.changed_ns / SECOND < _WRITTEN_S
+        return is_new and is_locked(self.paths[-1])
+
+    @property
+    def key(self) -> str:
+        """Name of files that are made of this content by this version."""
+        return _digest(f"{self.name} {self.size} {self.changed_ns} {__version__} {policy()}")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
+
+
+def recordings_in(folder: Path) -> list[Recording]:
+    """Return the recordings of a folder, newest first. Raises OSError if it cannot be read."""
+    runs: dict[str, list[tuple[Path, os.stat_result]]] = {}
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if not entry.name.endswith(SUFFIX) or not entry.is_file(follow_symlinks=False):
+                continue
+            with contextlib.suppress(FileNotFoundError):
+                status = entry.stat(follow_symlinks=False)
+                stem = entry.name.removesuffix(SUFFIX)
+                part = _PART.fullmatch(stem)
+                run = part[1] if part else stem
+                runs.setdefault(run, []).append((Path(entry.path), status))
+    found = []
+    for name, parts in runs.items():
+        parts.sort(key=lambda each: each[0].name)
+        size = sum(status.st_size for _, status in parts)
+        changed_ns = max(status.st_mtime_ns for _, status in parts)
+        found.append(Recording(name, tuple(path for path, _ in parts), size, changed_ns))
+    return sorted(found, key=lambda each: (each.changed_ns, each.name), reverse=True)
+
+
+class Job(NamedTuple):
+    """A file to make."""
+
+    recording: Recording
+    kind: str
+
+
+class Flights:
+    """The list of flights, and the worker that makes their files."""
+
+    def __init__(
+        self, folder: Path | None = None, min_free_bytes: int = 0, cache: Path = Path()
+    ) -> None:
+        self.disk = ""
+        """A line about the disk of the captures if its space is short."""
+        self._folder = folder
+        self._cache = cache / "flights"
+        self._min_free_bytes = min_free_bytes
+        self._recordings: dict[str, Recording] = {}
+        self._jobs: dict[tuple[str, str], Job] = {}
+        """The requested files in their order, by id and kind."""
+        self._failed: dict[tuple[str, str], str] = {}
+        """Reason why a file could not be made, by key and kind."""
+        self._current: Job | None = None
+        self._progress = 0.0
+        self._process: asyncio.subprocess.Process | None = None
+        self._looked_at = float("-inf")
+        self._awake = asyncio.Event()
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Make files while the context is open."""
+        tasks = [asyncio.create_task(self._work()), asyncio.create_task(self._watch_disk())]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    def routes(self) -> list[BaseRoute]:
+        return [
+            Route("/flights.json", self._list),
+            Route("/flights/{id}/capture/{part:int}", self._capture),
+            Route("/flights/{id}/{kind}", self._file),
+            Route("/make/{id}/{kind}", self._request),
+        ]
+
+    # --- answers
+
+    async def _list(self, _: Request) -> Response:
+        self._looked_at = time.monotonic()
+        problem = await asyncio.to_thread(self._scan)
+        self._awake.set()
+        kinds = [kind for kind in _COMMANDS if kind != _SUMMARY]
+        if importlib.util.find_spec("pyarrow") is None:
+            kinds.remove("parquet")
+        flights = await asyncio.to_thread(self._described)
+        content = {"problem": problem, "kinds": kinds, "flights": flights}
+        return JSONResponse(content)
+
+    async def _request(self, request: Request) -> Response:
+        """Order a file. Only the page itself may do it."""
+        if not is_command(request.headers):
+            return PlainTextResponse("Only for the page itself.\n", 403)
+        recording = self._recordings.get(request.path_params["id"])
+        kind = request.path_params["kind"]
+        if recording is None or kind not in _COMMANDS or request.method != "GET":
+            return PlainTextResponse("Not found.\n", 404)
+        if not self._made(recording, kind).exists():
+            self._failed.pop((recording.key, kind), None)
+            self._jobs[recording.id, kind] = Job(recording, kind)
+            self._awake.set()
+            if self._current is not None and self._current.kind == _SUMMARY:
+                self._kill()  # it is made again later
+        return Response(status_code=202)
+
+    async def _file(self, request: Request) -> Response:
+        recording = self._recordings.get(request.path_params["id"])
+        kind = request.path_params["kind"]
+        if recording is None or kind not in _COMMANDS:
+            return PlainTextResponse("Not found.\n", 404)
+        path = self._made(recording, kind)
+        name = f"{recording.name}.{_ENDINGS[kind]}"
+        if not path.exists():
+            return PlainTextResponse("Not made yet. Ask for it in the list of flights.\n", 404)
+        if kind == "report":
+            headers = {"Content-Security-Policy": f"{policy()}; frame-ancestors 'none'"}
+            return FileResponse(path, headers=headers)
+        return FileResponse(path, filename=name)
+
+    async def _capture(self, request: Request) -> Response:
+        recording = self._recordings.get(request.path_params["id"])
+        part = request.path_params["part"]
+        if recording is None or part >= len(recording.paths):
+            return PlainTextResponse("Not found.\n", 404)
+        path = recording.paths[part]
+        if not path.is_file():
+            return PlainTextResponse("Not found.\n", 404)
+        return FileResponse(path, filename=path.name, media_type="application/octet-stream")
+
+    # --- list
+
+    def _scan(self) -> str:
+        """Read the folder. Return a line about what is wrong with it, or ""."""
+        if self._folder is None:
+            return (
+                "There is no folder of captures. Set record.directory in the configuration, or "
+                "give --captures."
+            )
+        try:
+            found = recordings_in(self._folder)
+        except OSError as error:
+            self._recordings = {}
+            return f"{self._folder}: cannot be read: {error.strerror}."
+        self._recordings = {recording.id: recording for recording in found}
+        return ""
+
+    def _described(self) -> list[dict[str, Any]]:
+        described = []
+        for recording in self._recordings.values():
+            states = {kind: self._state(recording, kind) for kind in _COMMANDS}
+            described.append(
+                {
+                    "id": recording.id,
+                    "name": recording.name,
+                    "size": recording.size,
+                    "parts": len(recording.paths),
+                    "isWritten": recording.is_written,
+                    "summary": self._summary(recording),
+                    "states": states,
+                }
+            )
+        return described
+
+    def _state(self, recording: Recording, kind: str) -> Any:
+        """Return "made", "waiting", a progress from 0 to 1, {"failed": reason}, or None."""
+        failed = self._failed.get((recording.key, kind))
+        if failed is not None:
+            return {"failed": failed}
+        job = self._current
+        if job is not None and (job.recording.id, job.kind) == (recording.id, kind):
+            return round(self._progress, 2)
+        if (recording.id, kind) in self._jobs:
+            return "waiting"
+        if self._made(recording, kind).exists():
+            return "made"
+        return None
+
+    def _summary(self, recording: Recording) -> Any:
+        with contextlib.suppress(OSError, ValueError):
+            return json.loads(self._made(recording, _SUMMARY).read_text(encoding="utf-8"))
+        return None
+
+    def _made(self, recording: Recording, kind: str) -> Path:
+        return self._cache / f"{recording.key}.{_ENDINGS[kind]}"
+
+    # --- worker
+
+    async def _work(self) -> None:
+        while True:
+            job = self._next()
+            if job is None:
+                self._awake.clear()
+                await self._awake.wait()
+                continue
+            self._current = job
+            self._progress = 0.0
+            try:
+                await self._make(job)
+            except OSError as error:
+                self._failed[job.recording.key, job.kind] = f"{error.strerror or error}"
+            finally:
+                self._current = None
+                self._process = None
+            await asyncio.to_thread(self._prune)
+
+    def _next(self) -> Job | None:
+        """Return the next file to make: a requested one, or a missing summary."""
+        if self._jobs:
+            return self._jobs.pop(next(iter(self._jobs)))
+        if time.monotonic() - self._looked_at > _LOOKED_AT_S:
+            return None
+        for recording in self._recordings.values():
+            has_failed = (recording.key, _SUMMARY) in self._failed
+            if has_failed or self._made(recording, _SUMMARY).exists():
+                continue
+            if not recording.is_written:
+                return Job(recording, _SUMMARY)
+        return None
+
+    async def _make(self, job: Job) -> None:
+        recording = job.recording
+        self._cache.mkdir(mode=0o700, parents=True, exist_ok=True)
+        source = recording.paths[0].name
+        if len(recording.paths) > 1:
+            source = f"{recording.name}-"
+        words = {"source": f"./{source}", "output": str(self._made(recording, job.kind))}
+        command = [word.format(**words) for word in _COMMANDS[job.kind]]
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            *command,
+            cwd=recording.paths[0].parent,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,
+        )
+        self._process = process
+        _restrict(process.pid)
+        talk = asyncio.create_task(process.communicate())
+        end = time.monotonic() + _LIMIT_S
+        try:
+            while not talk.done() and time.monotonic() < end:
+                await asyncio.wait([talk], timeout=_POLL_S)
+                self._progress = max(self._progress, _progress_of(process.pid, recording))
+        finally:
+            self._kill()
+            _, said = await talk
+        if process.returncode == 0 or (job.kind == _SUMMARY and self._jobs):
+            return
+        lines = said.decode(errors="replace").strip().splitlines()
+        reason = lines[-1].removeprefix("kontronik-can-gw ")[:300] if lines else ""
+        if process.returncode is not None and process.returncode < 0:
+            reason = "it needed too much memory or time"
+        self._failed[recording.key, job.kind] = reason or "it failed"
+
+    def _kill(self) -> None:
+        process = self._process
+        if process is not None and process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+
+    def _prune(self) -> None:
+        """Remove files of changed and removed captures, and the oldest if there are too many."""
+        keys = {recording.key for recording in self._recordings.values()}
+        left = []
+        with contextlib.suppress(OSError):
+            for path in self._cache.iterdir():
+                status = path.stat()
+                if self._recordings and path.name.partition(".")[0] not in keys:
+                    path.unlink()
+                else:
+                    left.append((status.st_mtime_ns, status.st_size, path))
+            total = sum(size for _, size, _ in left)
+            for _, size, path in sorted(left):
+                if total <= _CACHE_BYTES:
+                    break
+                path.unlink()
+                total -= size
+        known = keys | {job.recording.key for job in self._jobs.values()}
+        self._failed = {key: text for key, text in self._failed.items() if key[0] in known}
+
+    async def _watch_disk(self) -> None:
+        while True:
+            self.disk = await asyncio.to_thread(self._disk_line)
+            await asyncio.sleep(_DISK_S)
+
+    def _disk_line(self) -> str:
+        if self._folder is None:
+            return ""
+        try:
+            status = os.statvfs(self._folder)
+        except OSError:
+            return ""
+        free = status.f_bavail * status.f_frsize
+        if free >= 2 * self._min_free_bytes:
+            return ""
+        limit = self._min_free_bytes // 1_000_000
+        return f"disk of the captures: {free // 1_000_000} MB free. Recording pauses below {limit}."
+
+
+def _restrict(pid: int) -> None:
+    """Limit a child process's memory and priority, as far as the system permits."""
+    with contextlib.suppress(OSError, ValueError):
+        resource.prlimit(pid, resource.RLIMIT_DATA, (_LIMIT_BYTES, _LIMIT_BYTES))
+        resource.prlimit(pid, resource.RLIMIT_CPU, (_LIMIT_S, _LIMIT_S))
+    with contextlib.suppress(OSError):
+        Path(f"/proc/{pid}/oom_score_adj").write_text(_OOM_ADJUSTMENT)
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, pid, _NICE)
+
+
+def _progress_of(pid: int, recording: Recording) -> float:
+    """Return the share of a recording that a process has read, by its positions in the files."""
+    begins = {}
+    size = 0
+    for path in recording.paths:
+        begins[str(path.resolve())] = size
+        with contextlib.suppress(OSError):
+            size += path.stat().st_size
+    read = 0
+    with contextlib.suppress(OSError, ValueError):
+        for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+            begin = begins.get(str(descriptor.readlink()))
+            if begin is not None:
+                lines = Path(f"/proc/{pid}/fdinfo", descriptor.name).read_text(encoding="ascii")
+                read = max(read, begin + int(lines.split()[1]))
+    return min(1.0, read / max(1, size))

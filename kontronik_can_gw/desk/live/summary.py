@@ -1,0 +1,69 @@
+"""Writes the numbers of one flight for the list of flights, in a process of its own.
+
+python -m kontronik_can_gw.desk.live.summary CAPTURE OUTPUT
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.desk.report.recorded import flight_of
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.printable import printable
+from kontronik_can_gw.times import MS, SECOND
+
+_CLOCK_IS_SET_MS = 1_577_836_800_000
+"""2020-01-01. An earlier date comes from a clock that was not set."""
+
+
+def summary_of(capture: Path) -> dict[str, Any]:
+    """Return the numbers of a flight. Raises UserError if the capture has no values."""
+    with open_input(capture) as recording:
+        flight = flight_of(recording)
+        if not flight.rows:
+            raise RunError(*recording.damage, f"{capture.name}: has no values")
+        wall_ns = recording.wall_ns(flight.origin_ns)
+        is_trusted = recording.trust.at(flight.origin_ns)
+        start_ms = None if wall_ns is None else wall_ns // MS
+        if start_ms is not None and (is_trusted is False or start_ms < _CLOCK_IS_SET_MS):
+            start_ms = None
+        currents = []
+        voltages = []
+        energies = []
+        for esc in flight.escs:
+            if "battery_current" in esc.extremes:
+                currents.append(esc.extremes["battery_current"].value)
+            if "battery_voltage" in esc.extremes:
+                voltages.append(esc.extremes["battery_voltage"].value)
+            if esc.energy_wh is not None:
+                energies.append(esc.energy_wh)
+        errors = [event for event in flight.events if event.severity == "error"]
+        warnings = [event for event in flight.events if event.severity == "warning"]
+        return {
+            "start": start_ms,
+            "duration": round((flight.end_ns - flight.start_ns) / SECOND, 1),
+            "current": max(currents, default=None),
+            "voltage": min(voltages, default=None),
+            "energy": round(sum(energies), 2) if energies else None,
+            "errors": len(errors),
+            "warnings": len(warnings),
+            "damage": len(recording.damage),
+        }
+
+
+def main(capture: str, output: str) -> int:
+    try:
+        summary = summary_of(Path(capture))
+    except UserError as error:
+        print(printable(error.problems[-1]), file=sys.stderr)
+        return error.exit_code
+    part = Path(f"{output}.part")
+    part.write_text(json.dumps(summary), encoding="utf-8")
+    part.replace(output)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
