@@ -29,8 +29,12 @@ _PROGRAM = f"/usr/bin/{NAME}"
 """The path of the program in the original units."""
 _RESTART = f"{NAME}-restart"
 """The units that restart a CAN interface, whose instances are named after it."""
-_KINDS = ("", "-mqtt", "-metrics")
-"""Suffixes of the services: the gateway's, and two optional ones."""
+_KINDS = ("", "-mqtt", "-metrics", "-web")
+"""Suffixes of the services: the gateway's, and three optional ones."""
+_OWN_FOLDERS = (
+    r"(?m)^(StateDirectory|RuntimeDirectory|CacheDirectory|Environment=STATE_DIRECTORY)=.*"
+)
+"""Lines of units with folders that each instance has for itself."""
 UNITS = "etc/systemd/system"
 _WANTS = f"{UNITS}/multi-user.target.wants"
 _BOOTED = Path("/run/systemd/system")
@@ -129,7 +133,7 @@ def planned(program: str) -> Iterator[tuple[str, str]]:
         yield f"{UNITS}/{NAME}{kind}.service", text
         # each instance has its own configuration and folders
         template = text.replace("/gateway.toml", "/%i.toml")
-        template = re.sub(r"(?m)^(StateDirectory|RuntimeDirectory)=.*", r"\g<0>-%i", template)
+        template = re.sub(_OWN_FOLDERS, r"\g<0>-%i", template)
         yield f"{UNITS}/{NAME}{kind}@.service", template
     for suffix in ("path", "service"):
         name = f"{_RESTART}@.{suffix}"

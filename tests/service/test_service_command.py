@@ -52,7 +52,8 @@ def test_a_staged_install_writes_files_that_all_users_may_read(tmp_path: Path) -
     names = [CONFIGURATION, *(place for place, _ in planned(""))]
     assert tree(tmp_path) == sorted(names)
     assert {(tmp_path / name).stat().st_mode & 0o777 for name in names} == {0o644}
-    for kind, command in (("", "run --wait"), ("-metrics", "metrics"), ("-mqtt", "mqtt")):
+    commands = {"": "run --wait", "-metrics": "metrics", "-mqtt": "mqtt", "-web": "web"}
+    for kind, command in commands.items():
         text = (tmp_path / UNITS / f"kontronik-can-gw{kind}.service").read_text()
         assert f"ExecStart={EXECUTABLE} {command} -c /etc/kontronik-can-gw/gateway.toml" in text
     assert "is the unchanged example. Set ports, bit rate and motors first." in done.err

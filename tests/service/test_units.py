@@ -1,6 +1,7 @@
 """The installed files, checked line by line, and by systemd's own tools if they are installed."""
 
 import ast
+import ipaddress
 import os
 import re
 import shutil
@@ -17,7 +18,9 @@ from kontronik_can_gw.runtime.system.folders import NAME, RUN
 
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
 BESIDE = tuple(
-    f"kontronik-can-gw-{kind}{end}.service" for kind in ("mqtt", "metrics") for end in ("", "@")
+    f"kontronik-can-gw-{kind}{end}.service"
+    for kind in ("mqtt", "metrics", "web")
+    for end in ("", "@")
 )
 ENABLE = "no systemd-analyze on this machine: sudo apt-get install systemd"
 MAX_EXPOSED = 2.0
@@ -89,7 +92,7 @@ def test_the_service_has_a_low_exposure_level(tmp_path: Path, beside: bool) -> N
         done = analyze("security", "--offline=true", "--no-pager", str(unit))
         found = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
         assert found, done.stdout + done.stderr
-        assert float(found[1]) <= MAX_EXPOSED
+        assert float(found[1]) <= (1.6 if "web" in unit.name else MAX_EXPOSED)
 
 
 def test_the_restart_of_an_interface_has_a_low_exposure_level(tmp_path: Path) -> None:
@@ -142,7 +145,10 @@ def test_a_service_never_gives_up_and_has_no_rights_of_root(name: str) -> None:
     assert not [name for name in unit if name.startswith(never)]
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if "metrics" not in name])
+LOCKING = [name for name in EVERY if "metrics" not in name and "web" not in name]
+
+
+@pytest.mark.parametrize("name", LOCKING)
 def test_a_service_that_reports_to_systemd_is_watched(name: str) -> None:
     """If it hangs, it is ended so that the log has the stack of each thread."""
     unit = settings(files()[name])
@@ -151,11 +157,32 @@ def test_a_service_that_reports_to_systemd_is_watched(name: str) -> None:
     assert {name: unit[name] for name in kept} == {name: [text] for name, text in kept.items()}
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if "metrics" not in name])
+@pytest.mark.parametrize("name", LOCKING)
 def test_a_service_may_write_the_locks_that_all_gateways_share(name: str) -> None:
     lock = f"-{RUN / NAME / 'lock'}"
     wanted = f"{lock} -{RUN / NAME / 'restart'}" if name in NAMES else lock
     assert settings(files()[name])["ReadWritePaths"] == [wanted]
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if "web" in name])
+def test_the_live_page_may_write_only_its_cache_and_reach_only_private_networks(
+    name: str,
+) -> None:
+    """docs/security.md states the figure."""
+    unit = settings(files()[name])
+    suffix = "-%i" if "@" in name else ""
+    assert unit["CacheDirectory"] == [f"kontronik-can-gw-web{suffix}"]
+    assert f"STATE_DIRECTORY=/var/lib/kontronik-can-gw{suffix}" in unit["Environment"]
+    assert unit["CacheDirectoryMode"] == ["0700"]
+    assert unit["ProtectSystem"] == ["strict"]
+    assert not {"ReadWritePaths", "StateDirectory", "RuntimeDirectory"} & set(unit)
+    families = set(unit["RestrictAddressFamilies"][0].split())
+    assert families == {"AF_CAN", "AF_UNIX", "AF_INET", "AF_INET6"}
+    assert "LISTEN=127.0.0.1:8044" in unit["Environment"]
+    allowed = unit["IPAddressAllow"][0].split()
+    private = [each for each in allowed if "/" in each]
+    assert all(ipaddress.ip_network(each).is_private for each in private)
+    assert set(allowed) - set(private) == {"localhost", "link-local"}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -189,6 +216,7 @@ IN_LIBRARIES: dict[str, set[str]] = {
     # paho connects to the broker; getaddrinfo asks the kernel for this machine's addresses
     "mqtt": {"AF_INET", "AF_INET6", "AF_NETLINK"},
     "metrics": set(),
+    "web": {"AF_INET", "AF_INET6", "AF_UNIX"},  # asyncio and uvicorn
 }
 """The address families that libraries need, by command."""
 
@@ -235,7 +263,11 @@ def test_a_unit_permits_the_socket_families_that_its_command_opens(name: str) ->
     if command == "metrics":
         # The modules that it shares with other commands open no socket there.
         modules = {PACKAGE / "desk" / "metrics.py"}
-    assert allowed_families(unit) == named_families(modules) | IN_LIBRARIES[command]
+    named = named_families(modules)
+    if command == "web":
+        # Without rtnetlink its advice on a missing interface has no bit rate.
+        named.remove("AF_NETLINK")
+    assert allowed_families(unit) == named | IN_LIBRARIES[command]
 
 
 def test_the_gateway_may_use_only_can_rtnetlink_and_the_notify_socket() -> None:
@@ -251,7 +283,7 @@ def test_an_instance_has_its_own_configuration_and_folders() -> None:
 
 
 def test_metrics_are_only_served_to_this_machine() -> None:
-    for name, config in zip(BESIDE[2:], ("gateway", "%i"), strict=True):
+    for name, config in zip(BESIDE[2:4], ("gateway", "%i"), strict=True):
         unit = settings(files()[name])
         command = f"/bin/true metrics -c /etc/kontronik-can-gw/{config}.toml --listen ${{LISTEN}}"
         assert unit["ExecStart"] == [command]

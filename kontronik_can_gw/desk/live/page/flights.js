@@ -64,7 +64,7 @@
         "Peak current": summary.current === null ? "–" : `${shown(summary.current, 1)} A`,
         "Lowest voltage": summary.voltage === null ? "–" : `${shown(summary.voltage, 2)} V`,
         Energy: summary.energy === null ? "–" : `${shown(summary.energy, 1)} Wh`,
-        Errors: `${summary.errors}${summary.warnings ? `, ${summary.warnings} warnings` : ""}`,
+        Errors: `${summary.errors}${summary.warnings ? `, warnings: ${summary.warnings}` : ""}`,
       });
     }
     const parts = [
