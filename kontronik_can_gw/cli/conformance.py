@@ -85,10 +85,10 @@ def main(args: argparse.Namespace) -> int:
         results = _results(slave, items, deviations)
     text = _report(args, eds, results)
     if args.output is not None:
-        write_output(args.output, text, force=True)
+        write_output(args.output, text, force=args.force)
     if args.junit is not None:
         xml = junit(results, f"CANopen conformance of {eds.name}")
-        write_output(args.junit, xml.decode("utf-8"), force=True)
+        write_output(args.junit, xml.decode("utf-8"), force=args.force)
     say(counts(results), args.command)
     return 1 if any(result.verdict is Verdict.FAILED for result in results) else 0
 

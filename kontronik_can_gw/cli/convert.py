@@ -139,7 +139,9 @@ def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
         conversion = _conversion(args, form, recording)
         # the rows of a pipe cannot be read again, but only text can be used without its end
         keeps_part = recording.stream is not None and form in ON_SCREEN
-        with writing(args.output, keeps_part=keeps_part, handles_signals=False) as out:
+        with writing(
+            args.output, force=args.force, keeps_part=keeps_part, handles_signals=False
+        ) as out:
             name = f"{Path(args.input).name or recording.name} to {form}:"
             out.watch = partial(watched, name=name, data_on_screen=args.output == "-")
             summary = conversion(recording, out)

@@ -1,13 +1,22 @@
 """``export``: writes the core in C with the tables of the DBC in use, for a firmware."""
 
 import argparse
+import os
 from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from kontronik_can_gw.cli.arguments import option
-from kontronik_can_gw.cli.common import say
+from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.desk import bus_layout
-from kontronik_can_gw.cli.output import check_output, configuration_files, output_of, writing
+from kontronik_can_gw.cli.output import (
+    check_output,
+    configuration_files,
+    interrupt,
+    output_of,
+    stopped,
+    writing,
+)
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.native.export_c import EXAMPLE, exported
@@ -77,8 +86,31 @@ def _write(folder: Path, files: dict[str, str], inputs: Sequence[Path], *, force
             problems += error.problems
     if problems:
         raise UserError(*problems)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in files.items():
-        with writing(str(folder / name)) as out:
-            out.open().write(text.encode())
-            out.is_whole = True
+    _write_all(folder, files, force=force)
+
+
+def _write_all(folder: Path, files: dict[str, str], *, force: bool) -> None:
+    """Write all files, or leave the folder as it was if one of them cannot be written."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            stack.enter_context(stopping_on_signals(interrupt))
+            outputs = []
+            for name, text in files.items():
+                path = str(folder / name)
+                out = stack.enter_context(writing(path, force=force, handles_signals=False))
+                outputs.append(out)
+                file = out.open()
+                file.write(text.encode())
+                file.flush()
+                os.fsync(file.fileno())  # a full disk is noticed before any file gets its name
+            for out in outputs:
+                out.is_whole = True
+    except BaseException as error:
+        with suppress(OSError):
+            for created in made:
+                created.rmdir()
+        if isinstance(error, KeyboardInterrupt):
+            say(stopped(str(folder)))
+        raise

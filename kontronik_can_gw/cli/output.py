@@ -2,9 +2,11 @@
 
 1. A file that exists is replaced only with ``--force``.
 2. A file that the command reads is never overwritten, also not through a link or with ``--force``.
-3. A file gets its name when it is complete. If writing fails or a signal ends it, the incomplete
-   file is removed.
-4. A pipe or a device is written to directly. ``-`` is standard output.
+3. A file has the name OUT.part until it is complete, and is locked. An OUT.part of another command
+   is not touched; ``--force`` replaces it if it is not being written.
+4. If writing fails or a signal ends it, the incomplete file is removed.
+5. A symbolic link is replaced, not followed.
+6. A pipe or a device is written to directly. ``-`` is standard output.
 """
 
 import argparse
@@ -17,7 +19,7 @@ from kontronik_can_gw.cli import discard_output, say
 from kontronik_can_gw.cli.arguments import default_config
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.config.parse import load
-from kontronik_can_gw.desk.recordings.convert import Output
+from kontronik_can_gw.desk.recordings.convert import Output, check_part, part_beside
 from kontronik_can_gw.desk.recordings.stream import is_standard_input
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
@@ -33,7 +35,7 @@ def check_output(output: str, inputs: Iterable[Path], *, force: bool) -> None:
     if output == "-":
         return
     target = Path(output)
-    part = Path(f"{target}.part")  # exists while the file is being written
+    part = part_beside(target)
     for path in inputs:
         for written in (target, part):
             with suppress(OSError):
@@ -43,13 +45,14 @@ def check_output(output: str, inputs: Iterable[Path], *, force: bool) -> None:
                     )
     try:
         is_folder = target.is_dir()
-        is_file = target.is_file()
+        is_file = target.is_file() or (target.is_symlink() and not target.exists())
     except OSError as error:  # for example: the name is too long
         raise RunError(f"{output}: cannot be written: {error.strerror}.") from None
     if is_folder:
         raise UserError(f"{output}: is a folder. Give a file.")
     if is_file and not force:
         raise UserError(f"{output}: exists. Give another name, or --force to replace it.")
+    check_part(part, force=force)
 
 
 def configuration_files(config: Path | None, dbc: Path | None = None) -> list[Path]:
@@ -102,22 +105,28 @@ def output_of(args: argparse.Namespace, name: str, default: str | None = None) -
 def writing(
     output: str,
     *,
+    force: bool,
     keeps_part: bool = False,
     handles_signals: bool = True,
 ) -> Iterator[Output]:
     """Open an output for writing. Raises RunError if it cannot be written.
 
-    ``keeps_part``: if writing fails, OUT.part stays. ``handles_signals``: SIGTERM, SIGINT and
-    SIGHUP raise KeyboardInterrupt. Without it the caller handles them.
+    ``force``: an existing file is replaced. ``keeps_part``: if writing fails, OUT.part stays.
+    ``handles_signals``: SIGTERM, SIGINT and SIGHUP raise KeyboardInterrupt, which is reported.
+    Without it the caller handles them.
     """
-    out = Output(None if output == "-" else Path(output))
+    out = Output(None if output == "-" else Path(output), force=force)
     out.keeps_part = keeps_part
     try:
         with ExitStack() as stack:
             if handles_signals:
-                stack.enter_context(stopping_on_signals(_interrupt))
+                stack.enter_context(stopping_on_signals(interrupt))
             stack.enter_context(out)
             yield out
+    except KeyboardInterrupt:
+        if handles_signals:
+            say(stopped(output))
+        raise
     except BrokenPipeError:
         raise
     except OSError as error:
@@ -146,11 +155,17 @@ def write_output(
         shown = printable(text, keep="\r\n\t") if sys.stdout.isatty() else text
         sys.stdout.buffer.write(shown.encode(encoding))
         return
-    with writing(output) as out:
+    with writing(output, force=force) as out:
         out.open().write(text.encode(encoding))
         out.is_whole = True
     say(f"{output} written")
 
 
-def _interrupt() -> None:
+def interrupt() -> None:
+    """Raise KeyboardInterrupt, as a handler of signals."""
     raise KeyboardInterrupt
+
+
+def stopped(output: str) -> str:
+    """Return the message after a signal has ended the writing of an output."""
+    return "stopped" if output == "-" else f"stopped: {output} was not written"

@@ -73,7 +73,7 @@ def write_parcel(
         unit = unit_of(machine, str(config.absolute()))
         folders = capture_folders(machine, config, unit, document)
         add_captures(contents, folders, with_dbc=not args.without_dbc)
-    with writing(args.parcel) as out:
+    with writing(args.parcel, force=args.force) as out:
         write_archive(out.open(), contents, made_ns)
         out.is_whole = True
     for line in contents.missing:

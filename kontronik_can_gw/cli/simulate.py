@@ -178,7 +178,7 @@ def _to_files(escs: list[SimulatedEsc], output: str, time_ns: int, *, force: boo
     for number, (esc, name) in enumerate(zip(escs, names, strict=True), 1):
         total = 0
         frames = 0
-        with writing(name) as out:
+        with writing(name, force=force) as out:
             file = out.open()
             now = esc.next_ns
             end = now + time_ns

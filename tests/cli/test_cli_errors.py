@@ -167,7 +167,7 @@ def test_a_missing_can_interface_is_reported_with_the_command_to_create_it(
 # --- dbc
 
 
-def test_a_dbc_is_written_into_a_pipe_or_link_without_replacing_it(tmp_path: Path) -> None:
+def test_a_dbc_is_written_into_a_pipe_and_replaces_a_link_with_force(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     reader = subprocess.Popen(["cat", str(pipe)], stdout=subprocess.PIPE, text=True)
@@ -180,9 +180,18 @@ def test_a_dbc_is_written_into_a_pipe_or_link_without_replacing_it(tmp_path: Pat
     link = tmp_path / "link"
     target = tmp_path / "target"
     link.symlink_to(target)
-    assert run("dbc", "-o", link).code == 0
-    assert link.is_symlink()
-    assert target.read_text().startswith("VERSION")
+    for content in (None, "mine"):
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
+        if content is not None:
+            target.write_text(content)
+        assert refused(2, "dbc", "-o", link).startswith(f"{link}: exists.")
+        assert link.is_symlink()
+        assert run("dbc", "-o", link, "--force").code == 0
+        assert not link.is_symlink()
+        assert link.read_text().startswith("VERSION")
+        assert target.exists() == (content is not None)
+    assert target.read_text() == "mine"
 
 
 # --- standard output

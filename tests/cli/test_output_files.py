@@ -1,5 +1,6 @@
 """Every command replaces an existing output only with --force, and never replaces an input."""
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -138,6 +139,105 @@ def test_an_export_replaces_files_only_with_force_and_never_its_input(folder: Pa
     assert (folder / "own.dbc").read_text().startswith("VERSION")
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_part_that_exists_is_replaced_only_with_force(command: str, folder: Path) -> None:
+    part = written(folder / "out.part", "rows of an interrupted command")
+    done = run(*command.format(o="out").split())
+    assert done.code == 2
+    assert done.out == ""
+    assert "out.part: exists. It may have the data of an earlier command" in done.err
+    assert "Rename it, or give --force" in done.err
+    assert part.read_text() == "rows of an interrupted command"
+    assert not (folder / "out").exists()
+    assert run(*command.format(o="out").split(), "--force").code == 0
+    assert not part.exists()
+    assert (folder / "out").stat().st_size > 100
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_part_that_is_being_written_is_never_replaced(command: str, folder: Path) -> None:
+    part = folder / "out.part"
+    with part.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        for force in ((), ("--force",)):
+            done = run(*command.format(o="out").split(), *force)
+            assert done.code == 2
+            assert "out.part: another process is writing it. Wait for its end" in done.err
+        assert part.exists()
+    assert not (folder / "out").exists()
+
+
+def test_a_file_that_appears_during_writing_is_kept(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def appear(_fd: int) -> None:
+        written(folder / "out", "precious")
+
+    monkeypatch.setattr(os, "fsync", appear)
+    done = run("convert", "x.bin", "out", "--to", "csv")
+    assert done.code == 1
+    assert "out: cannot be written: another program has created it meanwhile." in done.err
+    assert "The data so far are in out.part." in done.err
+    assert (folder / "out").read_text() == "precious"
+    assert (folder / "out.part").stat().st_size > 1000
+
+
+def test_the_rows_of_a_killed_conversion_survive_the_same_command(folder: Path) -> None:
+    command = [*PROGRAM, "convert", "-", "live.csv"]
+    part = folder / "live.csv.part"
+    rows = (folder / "x.bin").read_bytes()
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as first:
+        assert first.stdin is not None
+        first.stdin.write(rows)
+        first.stdin.flush()
+        end = time.monotonic() + 60
+        while not (part.exists() and part.stat().st_size):
+            assert first.poll() is None
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        for force in ((), ("--force",)):
+            done = run("convert", "-", "live.csv", *force, given=rows)
+            assert "another process is writing it" in done.err
+        first.kill()
+    kept = part.read_bytes()
+    assert len(kept) > 1000
+    done = run("convert", "-", "live.csv", given=rows)
+    assert done.code == 2
+    assert "live.csv.part: exists" in done.err
+    assert part.read_bytes() == kept
+
+
+def test_an_export_to_a_full_disk_leaves_the_folder_as_it_was(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill_up(count: int) -> None:
+        left = count
+
+        def sync(_fd: int) -> None:
+            nonlocal left
+            left -= 1
+            if left < 0:
+                raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", sync)
+
+    before = names(folder)
+    for count in range(6):
+        fill_up(count)
+        done = run("export", "c", "--dbc", "own.dbc", "deep/fw")
+        assert done.code == 1
+        assert "cannot be written: No space left on device" in done.err
+        assert names(folder) == before
+    monkeypatch.undo()
+    monkeypatch.chdir(folder)
+    assert run("export", "c", "--dbc", "own.dbc", "fw").code == 0
+    (folder / "fw" / "core.h").write_text("older")
+    files = {path.name: path.read_bytes() for path in (folder / "fw").iterdir()}
+    fill_up(2)
+    assert run("export", "c", "--dbc", "own.dbc", "fw", "--force").code == 1
+    assert {path.name: path.read_bytes() for path in (folder / "fw").iterdir()} == files
+
+
 def test_two_outputs_are_refused_and_so_is_a_missing_output() -> None:
     assert "OUT and -o: both are outputs" in run("convert", "x.bin", "a.csv", "-o", "b.csv").err
     assert "no output. Give OUT, or -o OUT." in run("convert", "x.bin").err
@@ -165,7 +265,7 @@ def test_a_signal_leaves_no_partly_written_file(number: int, folder: Path) -> No
         process.send_signal(number)
         _, said = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert said == ""
+    assert said == "kontronik-can-gw: stopped: long.bin was not written\n"
     assert names(folder) == before
 
 

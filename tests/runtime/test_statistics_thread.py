@@ -119,6 +119,26 @@ def test_the_file_is_complete_readable_by_all_and_removed_at_the_end(
     assert threading.active_count() == threads
 
 
+def test_a_file_of_the_user_is_neither_replaced_nor_removed(
+    file: Path, statistics: Statistics
+) -> None:
+    file.write_text("mine")
+    [report] = put(statistics, 1)
+    assert report.text == (
+        f"statistics file {file}: cannot be written: it exists and is not a status file. "
+        "Remove it, or choose another name. Trying again."
+    )
+    assert put(statistics, 2) == []
+    statistics.close()
+    assert file.read_text() == "mine"
+    after = Statistics(file)
+    file.write_text('{"format":1,"program":"kontronik-can-gw"}')  # left over by a killed gateway
+    put(after, 3)
+    assert number_in(file) == 3
+    after.close()
+    assert not file.exists()
+
+
 def test_a_disk_that_does_not_answer_is_reported_once_until_it_does(
     file: Path,
     statistics: Statistics,

@@ -4,6 +4,8 @@ Each conversion returns a text that describes the written data, or None if the r
 data. In that case nothing was written. Messages are the work of cli/convert.py.
 """
 
+import errno
+import fcntl
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -12,7 +14,8 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
 from kontronik_can_gw.desk.recordings.recording import counted
-from kontronik_can_gw.errors import RunError
+from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.runtime.files.disk import is_locked
 
 if TYPE_CHECKING:
     from kontronik_can_gw.desk.recordings.fields import Choice, Table
@@ -41,23 +44,26 @@ ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 class Output:
     """The destination of converted data: a file, or standard output if ``target`` is None.
 
-    A file is written as ``NAME.part`` beside its destination. It is renamed at the end if
-    ``is_whole`` was set. Pipes and devices such as /dev/stdout are written directly. ``what`` is
-    the noun for the destination in messages.
+    1. A file is written as ``NAME.part`` beside its destination. It is renamed at the end if
+       ``is_whole`` was set.
+    2. The part is locked while it is being written. A part that exists is never overwritten,
+       except with ``force`` if it is not locked: it may have the rows of an earlier conversion.
+    3. A symbolic link is replaced, never followed. Pipes and devices such as /dev/stdout are
+       written directly.
     """
 
     keeps_part = False
     """True if ``NAME.part`` is kept when writing fails, because the input cannot be read again."""
 
-    def __init__(self, target: Path | None, what: str = "file") -> None:
+    def __init__(self, target: Path | None, *, force: bool = False) -> None:
         self.is_whole = False
         self.watch: Callable[[Iterable[Any]], Iterable[Any]] = iter
         """All converted data pass through this, block by block."""
         self._target = target
-        self._what = what
+        self._force = force
         self._file: IO[bytes] | None = None
         self._part: Path | None = None
-        """The file that may have been created."""
+        """The file that this output has created."""
 
     @property
     def kept_part(self) -> Path | None:
@@ -75,46 +81,79 @@ class Output:
             if target.exists() and not target.is_file():
                 self._file = target.open("wb")
             else:
-                part = Path(os.path.realpath(target)).with_name(f"{target.name}.part")
-                part.unlink(missing_ok=True)
-                self._part = part  # before the file is opened, because a signal may interrupt
-                self._file = part.open("xb")  # does not follow a link that another user made
+                self._file = self._open_part(part_beside(target))
         except OSError as error:
             raise RunError(
-                f"{target}: cannot be written: {error.strerror}. Give another {self._what}."
+                f"{target}: cannot be written: {error.strerror}. Give another file."
             ) from None
         return self._file
+
+    def _open_part(self, part: Path) -> IO[bytes]:
+        """Create and lock the part. Raises UserError if it exists and must not be replaced."""
+        check_part(part, force=self._force)
+        if self._force:
+            part.unlink(missing_ok=True)
+        try:
+            file = part.open("xb")  # does not follow a link that another user made
+        except FileExistsError:  # another process was faster
+            check_part(part, force=False)
+            raise
+        self._part = part
+        # Some file systems have no locks. Then another process relies on the name.
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return file
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        is_kept = kind is None and self.is_whole
-        has_failed = kind is not None
         if kind is None and self._target is None:
             sys.stdout.flush()
+        has_failed = kind is not None
         try:
-            if self._file is not None:
-                # the disk may be full, which does not matter if the file is not kept
-                ignored = () if is_kept else (OSError,)
-                with suppress(*ignored):
-                    self._close(self._file, is_kept)
-            if is_kept and self._part is not None and self._target is not None:
-                self._part.replace(os.path.realpath(self._target))
-        except BaseException:
-            has_failed = True
-            raise
+            if kind is None and self.is_whole:
+                has_failed = True  # if it does not reach its end
+                self._finish()
         finally:
+            # The lock ends when the file is closed, so the name is removed before.
             if self._part is not None and not (has_failed and self.keeps_part):
                 self._part.unlink(missing_ok=True)
+            if self._file is not None:
+                with suppress(OSError):  # the disk may be full. All kept data are on the disk.
+                    self._file.close()
 
-    def _close(self, file: IO[bytes], is_kept: bool) -> None:
-        try:
-            if is_kept and self._part is not None:
-                file.flush()
-                os.fsync(file.fileno())
-        finally:
-            file.close()  # otherwise Python tries again when it exits, and prints an error
+    def _finish(self) -> None:
+        """Write all data to the disk, and give the file its name."""
+        if self._file is None:
+            return
+        self._file.flush()
+        if self._part is None or self._target is None:
+            return
+        os.fsync(self._file.fileno())
+        if not self._force and os.path.lexists(self._target):
+            self.keeps_part = True
+            raise FileExistsError(errno.EEXIST, "another program has created it meanwhile")
+        self._part.replace(self._target)
+        self._part = None
+
+
+def part_beside(target: Path) -> Path:
+    """Return the name that an output file has until it is complete."""
+    return Path(f"{target}.part")
+
+
+def check_part(part: Path, *, force: bool) -> None:
+    """Raise UserError if a part exists and must not be replaced."""
+    if is_locked(part):
+        raise UserError(
+            f"{part}: another process is writing it. Wait for its end, or give another name."
+        )
+    if not force and os.path.lexists(part):
+        raise UserError(
+            f"{part}: exists. It may have the data of an earlier command that was interrupted. "
+            "Rename it, or give --force to replace it."
+        )
 
 
 def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> str | None:

@@ -54,7 +54,7 @@ def reason_of(error: Exception) -> str:
 def is_locked(path: Path) -> bool:
     """Return True if this or another process has locked the file with flock."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:  # the file was removed
         return False
     try:

@@ -22,6 +22,8 @@ from kontronik_can_gw.times import SECOND
 
 PERIOD_NS = SECOND
 _CLOSE_S = 0.2
+_BEGIN = b'{"format":'
+"""The first bytes of each status file."""
 
 
 def open_statistics(
@@ -85,6 +87,16 @@ def _is_recent(path: Path) -> bool:
 
 def _lock_name(file: Path) -> str:
     return f"{os.path.realpath(file)}/statistics/0"
+
+
+def _has_other_content(path: Path) -> bool:
+    """Return True if a file has content that no gateway has written as its status."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(len(_BEGIN))
+    except FileNotFoundError:
+        return False
+    return begin not in (b"", _BEGIN)
 
 
 class Statistics:
@@ -160,6 +172,9 @@ class Statistics:
             # os.path and os.replace are cheaper than pathlib, and this runs every second.
             if not os.path.isfile(path) and path.exists():  # noqa: PTH113
                 raise OSError(errno.EINVAL, "it is not a regular file")  # e.g. /dev/null
+            if not self._is_ours and _has_other_content(path):
+                reason = "it exists and is not a status file. Remove it, or choose another name"
+                raise OSError(errno.EEXIST, reason)
             write_new(temporary, data, 0o644, is_synced=True)
             os.replace(temporary, path)  # noqa: PTH105
         except OSError as error:
