@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from capture_bench import START, Bench, made
 
-from kontronik_can_gw.capture.format import Entry, EntryKind
+from kontronik_can_gw.capture.format import Entry, EntryKind, read_numbers
 from kontronik_can_gw.capture.recorded_gateway import state_of
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.keys import RecordConfig
@@ -16,6 +16,7 @@ from kontronik_can_gw.runtime.files.event_recorder import EventRecorder, Ring
 from kontronik_can_gw.runtime.system.clock import ClockFacts
 from kontronik_can_gw.times import MS, SECOND
 
+REMARKS = (EntryKind.LOST, EntryKind.CLOCK)
 BOTH = pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
 
 
@@ -40,6 +41,15 @@ class Flight:
         self.it.header = self.bench.setup.header() | known
         self.it.start(wait=True)
         self._given = 0
+        self.put: list[Entry] = []
+        """All entries that the recorder was given."""
+        put = self.it.put
+
+        def noted(*entry: object) -> None:
+            put(*entry)  # type: ignore[arg-type]
+            self.put.append(Entry(*entry))  # type: ignore[arg-type]
+
+        self.it.put = noted  # type: ignore[assignment]
 
     def fly(self, seconds: float) -> int:
         """Fly for some seconds. The recorder works twice a second. Return the time."""
@@ -283,10 +293,10 @@ def test_entries_and_an_event_that_waited_for_the_thread_are_recorded(
     flight = Flight(tmp_path, before_s=1, after_s=1)
     flight.fly(20)
     work = flight.it._work
-    flight.it._work = lambda _items: None  # type: ignore[method-assign]
+    flight.it._work = lambda _items: None  # type: ignore[assignment]
     event = flight.event("undervoltage")
     flight.fly(25)
-    flight.it._work = work  # type: ignore[method-assign]
+    flight.it._work = work  # type: ignore[assignment]
     flight.fly(4)
     flight.it.close()
     frames, _ = replayed(flight.captures()[0])
@@ -359,6 +369,54 @@ def test_lost_entries_are_counted_while_the_disk_fails_for_long(tmp_path: Path) 
     flight.it.reports(0)
     assert flight.it.facts.lost > 1000
     flight.it.close()
+
+
+@pytest.mark.parametrize("ends_before", [False, True])
+def test_a_capture_states_exactly_what_a_full_disk_has_cost(
+    ends_before: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """``ends_before``: the capture ends during the loss, so nothing follows the loss in it."""
+    monkeypatch.setattr(event_recorder, "_BYTES_PER_S", 3000)
+    flight = Flight(tmp_path, before_s=2, after_s=4)
+    flight.fly(6)
+
+    def fail(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recorder.CapturePart, "append", fail)
+        for _ in range(20):
+            event = flight.event("undervoltage")
+            flight.fly(1)
+        if ends_before:
+            flight.fly(7)
+    for path in flight.captures():
+        path.unlink()
+    for _ in range(0 if ends_before else 5):
+        flight.event("undervoltage")
+        flight.fly(1)
+    flight.fly(10)
+    flight.it.close()
+    flight.it.reports(0)
+    [path] = flight.captures()
+    with open_input(path) as found:
+        assert isinstance(found, CaptureInput)
+        kept = list(found.entries())
+        list(found.frames())
+        [damage] = found.damage
+    remarks = [entry for entry in kept if entry.kind == EntryKind.LOST]
+    [lost] = [read_numbers(entry.data)[0] for entry in remarks]
+    begin = kept[0].time_ns
+    end = max(kept[-1].time_ns, event + 4 * SECOND)
+    put = [entry for entry in flight.put if begin <= entry.time_ns < end]
+    captured = [entry for entry in kept if entry.kind not in REMARKS and entry.time_ns < end]
+    assert len(put) - len(captured) > 1000
+    assert lost >= len(put) - len(captured)
+    assert lost == flight.it.facts.lost
+    assert damage.startswith(f"{lost} entries could not be recorded")
+    assert (kept[-1] == remarks[0]) == ends_before
 
 
 def test_a_line_for_the_log_names_the_file(tmp_path: Path) -> None:

@@ -194,6 +194,26 @@ def test_writing_to_a_failed_disk_is_tried_again(
         recorded(folder, "was not closed")
 
 
+def test_a_remark_that_is_not_written_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk fails again in the block that has the number of lost entries."""
+    bed = Bed(tmp_path)
+    assert bed.step(*entries(10)) == ""
+
+    def fail(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    for since in (10, 20, 30):
+        with monkeypatch.context() as patch:
+            patch.setattr(recorder.CapturePart, "append", fail)
+            assert bed.step(*entries(10, since), after_s=6) != ""
+    assert bed.step(*entries(10, 40), after_s=6) == ""
+    kept, lost, _ = bed.closed()
+    assert kept == entries(10) + entries(10, 40)
+    assert lost == 30
+
+
 def test_an_unusable_folder_is_refused_or_waited_for(tmp_path: Path) -> None:
     """With ``wait``, the recorder waits for the folder as it does for devices."""
     (tmp_path / "place").touch()

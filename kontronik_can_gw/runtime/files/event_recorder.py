@@ -26,6 +26,7 @@ from kontronik_can_gw.capture.format import (
     json_payload,
     packed,
     read_json,
+    read_numbers,
 )
 from kontronik_can_gw.capture.replay import SETTLE_NS
 from kontronik_can_gw.config.keys import RecordConfig
@@ -35,6 +36,7 @@ from kontronik_can_gw.runtime.files.recorder import (
     Item,
     Recorder,
     RecorderFacts,
+    remark_of_losses,
 )
 from kontronik_can_gw.runtime.status.facts import utc
 from kontronik_can_gw.runtime.system.clock import ClockFacts
@@ -108,7 +110,9 @@ class Chunk(NamedTuple):
     segment: Segment
     payload: Packed
     entries: int
-    """Number of entries."""
+    """Number of entries, without remarks about losses and the clock."""
+    missing: int
+    """Number of lost entries that its remarks mention."""
 
 
 class Ring:
@@ -126,8 +130,12 @@ class Ring:
         self._segments: deque[Segment] = deque()
         self._chunks: deque[Chunk] = deque()
         self._number = 0
-        self._is_cut = False
+        self.is_cut = False
         """True if entries are ignored until the next segment begins."""
+        self.missing = 0
+        """Number of entries that are missing after the newest one in the ring."""
+        self.newest_ns = 0
+        """Time of the newest entry."""
 
     def add(
         self,
@@ -138,53 +146,70 @@ class Ring:
     ) -> int:
         """Append entries. Return the number of dropped entries that were not written.
 
-        ``holds``: old entries are kept, and new entries are dropped if the ring is full. A disk
-        that fails should not cost the seconds before an event.
+        The number of missing entries is remarked as soon as entries follow, at the end of the
+        segment before them. So each capture with that place has the remark. ``holds``: old entries
+        are kept, and new entries are dropped if the ring is full. A disk that fails should not cost
+        the seconds before an event.
         """
         lost = 0
         for part in _cut(items):
             begin_ns, kind, _, state, _, _ = part[0]
             is_begin = kind == EntryKind.STATE
             is_held = holds and bool(self._segments)
-            if self._is_cut and (is_held or not is_begin):
-                lost += len(part)
-                continue
             payload = packed(data_payload(part))
-            if holds and self.bytes + len(payload.stored) > self._max_bytes:
-                lost += len(part)
-                self._is_cut = True
+            is_ignored = self.is_cut and (is_held or not is_begin)
+            if is_ignored or (holds and self.bytes + len(payload.stored) > self._max_bytes):
+                entries, missing = _counts(part)
+                lost += entries
+                self.missing += entries + missing
+                self.is_cut = True
                 continue
-            self._is_cut = False
-            if is_begin or not self._segments:
+            self.is_cut = False
+            before = self._segments[-1] if self._segments else None
+            if is_begin or before is None:
                 self._segments.append(Segment(begin_ns, state if is_begin else b"", offset, clock))
-            self._number += 1
-            chunk = Chunk(self._number, begin_ns, self._segments[-1], payload, len(part))
-            self._chunks.append(chunk)
-            self.bytes += len(payload.stored)
+            if self.missing:
+                time_ns = begin_ns if before is None else self.newest_ns
+                remark = [remark_of_losses(time_ns, self.missing)]
+                self.missing = 0
+                segment = before or self._segments[-1]
+                self._append(segment, remark, packed(data_payload(remark)))
+            self._append(self._segments[-1], part, payload)
             if not holds:
-                lost += self._drop_old(part[-1][0])
+                lost += self._drop_old()
             while self.bytes > self._max_bytes:
-                lost += self._drop_segment()
-                self._is_cut = not self._segments
+                dropped = self._drop_segment()
+                lost += sum(chunk.entries for chunk in dropped)
+                self.is_cut = not self._segments
+                if self.is_cut:
+                    self.missing += sum(chunk.entries + chunk.missing for chunk in dropped)
         return lost
 
-    def _drop_old(self, newest_ns: int) -> int:
+    def _append(self, segment: Segment, items: Sequence[Item], payload: Packed) -> None:
+        self._number += 1
+        chunk = Chunk(self._number, items[0][0], segment, payload, *_counts(items))
+        self._chunks.append(chunk)
+        self.bytes += len(payload.stored)
+        self.newest_ns = items[-1][0]
+
+    def _drop_old(self) -> int:
         """Drop old segments. Return the number of their entries that were not written."""
         segments = self._segments
         lost = 0
-        while len(segments) > 1 and segments[1].begin_ns <= newest_ns - self._keep_ns:
-            lost += self._drop_segment()
+        while len(segments) > 1 and segments[1].begin_ns <= self.newest_ns - self._keep_ns:
+            lost += sum(chunk.entries for chunk in self._drop_segment())
         return lost
 
-    def _drop_segment(self) -> int:
+    def _drop_segment(self) -> list[Chunk]:
+        """Drop the oldest segment. Return its chunks that were not written."""
         segment = self._segments.popleft()
-        lost = 0
+        dropped = []
         while self._chunks and self._chunks[0].segment is segment:
             chunk = self._chunks.popleft()
             self.bytes -= len(chunk.payload.stored)
             if chunk.number > self.written:
-                lost += chunk.entries
-        return lost
+                dropped.append(chunk)
+        return dropped
 
     def unwritten(self, end_ns: int) -> list[Chunk]:
         """Return the chunks that were not written, of segments that begin before ``end_ns``."""
@@ -197,6 +222,13 @@ class Ring:
     def is_complete(self, end_ns: int) -> bool:
         """Return True if no entry can be added to the segments that begin before ``end_ns``."""
         return bool(self._segments) and self._segments[-1].begin_ns >= end_ns
+
+
+def _counts(items: Sequence[Item]) -> tuple[int, int]:
+    """Return the number of entries that are no remarks, and the number of losses in remarks."""
+    entries = sum(item[1] not in (EntryKind.LOST, EntryKind.CLOCK) for item in items)
+    missing = [read_numbers(item[3])[0] for item in items if item[1] == EntryKind.LOST]
+    return entries, sum(missing)
 
 
 def _cut(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
@@ -279,17 +311,14 @@ class EventRecorder(Recorder):
         """Add entries to the ring. Count those that a capture will not have."""
         is_active = self._until_ns is not None
         holds = is_active and self._file is None
-        remarked = self._recorded_losses
-        given = len(items)
         self._append_remarks(items, now)
         dropped = self._ring.add(items, self._offset, self._recorded_clock, holds)
-        if holds and dropped:  # the remarks were dropped, too, so they are made again
-            dropped -= len(items) - given
-            self._recorded_losses = remarked
+        if self._ring.is_cut:  # the remark about the clock was dropped, too
             self._offset = 0
             self._clock_ns = 0
         if is_active:
             self._unwritten += dropped
+            self._recorded_losses += dropped  # the ring remarks them
         is_full = holds and dropped > 0
         text = "captures: there is room in memory again"
         if is_full:
@@ -382,6 +411,13 @@ class EventRecorder(Recorder):
         if not self._has_next_part:
             self._spared = file.path  # it has the event
         return file
+
+    def _end(self) -> None:
+        file = self._file
+        if file is not None and self._ring.missing:
+            remark = remark_of_losses(self._ring.newest_ns, self._ring.missing)
+            file.append(packed(data_payload([remark])))
+        super()._end()
 
     def _end_capture(self) -> None:
         self._end_part()

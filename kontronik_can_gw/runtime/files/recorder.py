@@ -122,7 +122,7 @@ class Recorder:
         self._devices: list[Any] = []
         self._recorded_devices: list[Any] = []
         self._worker: Worker[None] = Worker(
-            "recorder", self._work, wait=self._wait, ended=self._end_part, clock=clock
+            "recorder", self._work, wait=self._wait, ended=self._end, clock=clock
         )
         self._is_usable = False
         """True if the last check found that the folder can be used."""
@@ -212,11 +212,14 @@ class Recorder:
         while True:
             items = [entries.popleft() for _ in range(min(_AT_ONCE, len(entries)))]
             now = self._clock()
+            given = len(items)
+            remarked = self._recorded_losses
             try:
                 self._write(items, now)
             except Exception as error:  # a bug must not end the recorder either
                 if not self._keeps_items:
-                    self._unwritten += len(items)
+                    self._unwritten += given
+                    self._recorded_losses = remarked  # a remark was not written either
                 self._fail(error, now)
                 break
             if not entries:
@@ -281,7 +284,7 @@ class Recorder:
         lost = self._overflowed + self._unwritten - self._recorded_losses
         if lost > 0:
             self._recorded_losses += lost
-            items.append((last, EntryKind.LOST, 0, numbers_data(lost), 0, None))
+            items.append(remark_of_losses(last, lost))
         clock = self.clock_facts
         recorded = self._recorded_clock
         is_changed = (clock.synchronized, clock.steps) != (recorded.synchronized, recorded.steps)
@@ -354,12 +357,21 @@ class Recorder:
         name = f"{self._stamp}-{self._run[:6]}-{part:05d}{SUFFIX}"
         return CapturePart(self._folder / name, json_payload(header), self._clock())
 
+    def _end(self) -> None:
+        """End the recording."""
+        self._end_part()
+
     def _end_part(self) -> None:
         file = self._file
         self._file = None
         if file is not None:
             self.facts.file = ""
             self.facts.bytes += file.close()
+
+
+def remark_of_losses(time_ns: int, lost: int) -> Item:
+    """Return the entry about entries that could not be recorded."""
+    return time_ns, EntryKind.LOST, 0, numbers_data(lost), 0, None
 
 
 class CapturePart:
