@@ -49,7 +49,7 @@ class Flight:
             put(*entry)  # type: ignore[arg-type]
             self.put.append(Entry(*entry))  # type: ignore[arg-type]
 
-        self.it.put = noted  # type: ignore[assignment]
+        self.it.put = noted  # type: ignore[method-assign,assignment]
 
     def fly(self, seconds: float) -> int:
         """Fly for some seconds. The recorder works twice a second. Return the time."""
@@ -293,10 +293,10 @@ def test_entries_and_an_event_that_waited_for_the_thread_are_recorded(
     flight = Flight(tmp_path, before_s=1, after_s=1)
     flight.fly(20)
     work = flight.it._work
-    flight.it._work = lambda _items: None  # type: ignore[assignment]
+    flight.it._work = lambda _items: None  # type: ignore[method-assign]
     event = flight.event("undervoltage")
     flight.fly(25)
-    flight.it._work = work  # type: ignore[assignment]
+    flight.it._work = work  # type: ignore[method-assign]
     flight.fly(4)
     flight.it.close()
     frames, _ = replayed(flight.captures()[0])

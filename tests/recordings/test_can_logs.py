@@ -1,5 +1,8 @@
 """CAN logs are written and read as by python-can, frame by frame and to the microsecond."""
 
+import struct
+import zlib
+from itertools import chain
 from pathlib import Path
 
 import can
@@ -8,6 +11,7 @@ from command_line import run
 from log_files import (
     READERS,
     SUFFIX,
+    WALL_NS,
     at_wall,
     message_of,
     opened,
@@ -18,6 +22,7 @@ from log_files import (
 )
 
 from kontronik_can_gw.desk.recordings.log_input import log_format
+from kontronik_can_gw.desk.recordings.recording import LogFrame
 from kontronik_can_gw.frames import CanFrame
 
 FORMATS = sorted(READERS)
@@ -113,6 +118,91 @@ def test_the_content_decides_on_the_format_and_not_the_suffix(tmp_path: Path) ->
         path = tmp_path / f"{format_}.bin"
         write_log(path, format_, some_frames(5))
         assert log_format(path.read_bytes()) == format_
+
+
+@pytest.mark.parametrize("gap_s", [1, 3600])
+@pytest.mark.parametrize("format_", ["asc", "trc"])
+def test_each_head_of_joined_logs_begins_a_session_with_its_date(
+    tmp_path: Path, format_: str, gap_s: int
+) -> None:
+    items = some_frames(50)
+    last_s = items[-1][0] // 10**9 + 1
+    starts = [WALL_NS + number * (last_s + gap_s) * 10**9 for number in range(3)]
+    joined = b""
+    expected = []
+    for number, start_ns in enumerate(starts):
+        part = tmp_path / f"{number}.{format_}"
+        write_log(part, format_, items, start_ns)
+        joined += part.read_bytes()
+        expected += read_log(part)[0]
+    path = tmp_path / f"joined.{format_}"
+    path.write_bytes(joined)
+    found, damage = read_log(path)
+    assert damage == []
+    assert found == expected
+
+
+def test_relative_times_of_a_joined_asc_begin_anew(tmp_path: Path) -> None:
+    text = ""
+    for hour, base in ((10, "hex"), (11, "dec")):
+        text += f"date Tue Nov 14 {hour}:00:00.000 2023\nbase {base}  timestamps relative\n"
+        text += "  1.000000 1  ErrorFrame\n"
+        text += "  1.000000 1  100  Rx   d 1 10\n" * 2
+    path = tmp_path / "joined.asc"
+    path.write_text(text)
+    found = []
+    with opened(path) as log:
+        for item in chain.from_iterable(log.batches()):
+            assert isinstance(item, LogFrame)
+            found.append((item.time_ns // 10**9, item.frame.can_id))
+    error = 0x20000080
+    assert found == [
+        (1, error),
+        (2, 0x100),
+        (3, 0x100),
+        (3601, error),
+        (3602, 100),
+        (3603, 100),
+    ]
+
+
+@pytest.mark.parametrize("unit", ["10 us", "1 ns"])
+def test_times_before_the_start_of_a_blf_are_read(tmp_path: Path, unit: str) -> None:
+    """Pre-trigger buffers write them, as in a log whose start was changed later."""
+    items = some_frames(50)
+    path = tmp_path / "log.blf"
+    write_log(path, "blf", items)
+    whole = zlib_blocks_of(path)
+    flags, factor = (1, 10_000) if unit == "10 us" else (2, 1)
+    at = 0
+    times = []
+    while (at := whole.find(b"LOBJ", at)) >= 0:
+        _, time = struct.unpack_from("<L4xQ", whole, at + 16)
+        early = (time - 10**10) // factor
+        times.append(early * factor)
+        struct.pack_into("<L", whole, at + 16, flags)
+        struct.pack_into("<q", whole, at + 24, early)
+        at += 4
+    head = path.read_bytes()[:144]
+    container = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(whole), 10, 0, len(whole))
+    path.write_bytes(head + container + whole)
+    found, damage = read_log(path)
+    assert not [line for line in damage if "cut off" not in line]
+    start_ns = WALL_NS // 10**6 * 10**6
+    assert sorted(time_ns - start_ns for time_ns, _, _ in found) == sorted(times)
+    assert min(times) < 0 < max(times)
+
+
+def zlib_blocks_of(path: Path) -> bytearray:
+    """Return the objects in the containers of a BLF log."""
+    data = path.read_bytes()
+    at = 144
+    found = bytearray()
+    while data[at : at + 4] == b"LOBJ":
+        (size,) = struct.unpack_from("<L", data, at + 8)
+        found += zlib.decompress(data[at + 32 : at + size])
+        at += size + size % 4
+    return found
 
 
 def test_can_fd_frames_are_left_out_of_trc_with_a_warning(tmp_path: Path) -> None:

@@ -46,7 +46,12 @@ class AscReader(TextReader):
     _now = 0
     """Time of the last line, if times are relative."""
 
-    def _read_head(self, lines: list[bytes]) -> None:
+    def _is_head(self, line: bytes, is_inside: bool) -> bool:
+        if is_inside:
+            return _frame(line) is None and b"errorframe" not in line.lower()
+        return line.lstrip()[:5].lower() == b"date "
+
+    def _read_head(self, lines: list[bytes]) -> int | None:
         written = None
         began = None
         for line in lines:
@@ -68,14 +73,14 @@ class AscReader(TextReader):
         else:
             found = None
         began = began or written
+        self._now = 0
         if began is None:
-            return
+            return None
         if found is not None and not self._relative:
             first_s = float(found["time"])
             began = _time_zero(began, written or began, first_s)
         start_ns = _unix_ns(began)
-        if start_ns >= OLDEST_WALL_S * SECOND:
-            self.wall_start_ns = start_ns
+        return start_ns if start_ns >= OLDEST_WALL_S * SECOND else None
 
     def _frame(self, line: bytes) -> LogFrame | None:
         line = line.lower()

@@ -29,12 +29,17 @@ from kontronik_can_gw.times import MS, SECOND
 
 with without_asammdf():
     from can import BLFReader
+    from can.io import blf
     from can.io.blf import BLFParseError
 
 if TYPE_CHECKING:
     from can import Message
 
 logging.getLogger("can.io").setLevel(logging.CRITICAL)  # the readers here report its problems
+# Times are signed, because a pre-trigger buffer has frames from before the start. python-can reads
+# them as unsigned.
+blf.OBJ_HEADER_V1_STRUCT = struct.Struct("<LHHq")
+blf.OBJ_HEADER_V2_STRUCT = struct.Struct("<LBxHq8x")
 _MIN_OBJECT = 32
 _MAX_OBJECT = 1 << 20
 """Limits of an object's size in a BLF container. A larger object would contain all later ones."""
@@ -99,7 +104,7 @@ def _error_message(data: bytes) -> "Message":
     from can import Message
 
     (header_size,) = struct.unpack_from("<H", data, 4)
-    flags, time = struct.unpack_from("<L4xQ", data, 16)
+    flags, time = struct.unpack_from("<L4xq", data, 16)
     unit = 1e-5 if flags == 1 else 1e-9
     return Message(time * unit, is_error_frame=True, channel=data[header_size] - 1)
 

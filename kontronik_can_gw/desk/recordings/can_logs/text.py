@@ -10,6 +10,7 @@ import re
 from binascii import unhexlify
 from collections.abc import Iterator, Sequence
 from io import BufferedReader
+from itertools import takewhile
 from typing import Any, BinaryIO
 
 from kontronik_can_gw.desk.recordings.recording import ERROR, LATEST_NS, LogFrame
@@ -118,7 +119,9 @@ class LogReader:
 class TextReader(LogReader):
     """Reads a log line by line.
 
-    ``file`` is at its beginning. Its first buffer must contain the log's head.
+    ``file`` is at its beginning. Its first buffer must contain the log's head. A later head begins
+    a new session, because logs can be joined. If both have a date, the times of the session count
+    from the date of the log's first head.
     """
 
     def __init__(self, file: BufferedReader) -> None:
@@ -131,8 +134,13 @@ class TextReader(LogReader):
         """Number of the last damaged line."""
         self._shown: list[str] = []
         """Numbers of the first damaged lines."""
+        self._later_head: list[bytes] = []
+        """The lines of a later head that have been read so far."""
+        self._is_first_head = True
+        self._session_ns = 0
+        """Time between the date of the log and the date of the session."""
         head = io.BytesIO(file.peek()).readlines()
-        self._read_head(head[:_HEAD_LINES])
+        self.wall_start_ns = self._read_head(head[:_HEAD_LINES])
 
     def __iter__(self) -> Iterator[LogFrame]:
         while line := self._file.readline(LONGEST_LINE):
@@ -150,8 +158,10 @@ class TextReader(LogReader):
         number = self._line_number
         self._line_number += line.endswith(b"\n")
         try:
-            if line.strip():
+            if line.strip() and not self._is_in_head(line):
                 item = self._frame(line)
+                if item is not None and self._session_ns:
+                    item = self._in_session(item)
         except (ValueError, LookupError):  # a damaged number, text or length
             self._note_damage(number)
         return item
@@ -174,8 +184,37 @@ class TextReader(LogReader):
             text += f" and {count - _SHOWN} more"
         self.damage.insert(0, text)
 
-    def _read_head(self, lines: list[bytes]) -> None:
-        """Read the settings in the log's head."""
+    def _is_in_head(self, line: bytes) -> bool:
+        """Return True for a line of a head. The line after a later head begins its session."""
+        if self._is_head(line, bool(self._later_head)):
+            if len(self._later_head) < _HEAD_LINES:
+                self._later_head.append(line)
+            return True
+        if self._later_head:
+            head = [*self._later_head, line]
+            self._later_head = []
+            if not self._is_first_head:
+                start_ns = self._read_head(head)
+                if start_ns is not None and self.wall_start_ns is not None:
+                    self._session_ns = start_ns - self.wall_start_ns
+        self._is_first_head = False
+        return False
+
+    def _in_session(self, item: LogFrame) -> LogFrame:
+        """Return a frame with its time since the date of the log. Unix times stay as they are."""
+        if item.time_ns >= OLDEST_WALL_S * SECOND:
+            return item
+        return checked(item._replace(time_ns=item.time_ns + self._session_ns))
+
+    def _is_head(self, line: bytes, is_inside: bool) -> bool:
+        """Return True if a line belongs to a head. ``is_inside``: the line before it does."""
+        raise NotImplementedError
+
+    def _read_head(self, lines: list[bytes]) -> int | None:
+        """Read the settings in a head, which may be followed by a frame.
+
+        Returns the Unix time in ns from which the times count. None if the head has no date.
+        """
         raise NotImplementedError
 
     def _frame(self, line: bytes) -> LogFrame | None:
@@ -245,10 +284,14 @@ class CandumpReader(TextReader):
     incomplete line, which is the last one in most buffers, is read alone.
     """
 
-    def _read_head(self, lines: list[bytes]) -> None:
+    def _is_head(self, line: bytes, is_inside: bool) -> bool:  # noqa: ARG002  it has no head
+        return False
+
+    def _read_head(self, lines: list[bytes]) -> int | None:
         first = next(filter(None, map(candump_line, lines)), None)
         if first is not None and float(first["time"]) >= OLDEST_WALL_S:
-            self.wall_start_ns = 0
+            return 0
+        return None
 
     def __iter__(self) -> Iterator[LogFrame]:
         file = self._file
@@ -339,11 +382,15 @@ The head of later versions names the columns.
 class TrcReader(TextReader):
     """The reader of PEAK TRC, file versions 1.0, 1.1, 1.3, 2.0 and 2.1."""
 
-    def _read_head(self, lines: list[bytes]) -> None:
+    def _is_head(self, line: bytes, is_inside: bool) -> bool:
+        return line.lstrip().startswith(b";") and (is_inside or trc_line(line) is not None)
+
+    def _read_head(self, lines: list[bytes]) -> int | None:
         with without_asammdf():
             from can.io.trc import TRCFileVersion, TRCReader
             from can.util import dlc2len
-        head = b"".join(line for line in lines if line.startswith(b";")).decode("latin-1")
+        is_in_head = re.compile(rb"\s*(?:;|$)").match
+        head = b"".join(takewhile(is_in_head, lines)).decode("latin-1")
         self._length_of_code = dlc2len
         parser = TRCReader(io.StringIO(head))
         self._parser = parser
@@ -357,9 +404,11 @@ class TrcReader(TextReader):
         version = "".join(filter(str.isdigit, parser.file_version.name))
         self._columns = _TRC_COLUMNS.get(version, parser.columns)
         self._has_direction = version not in ("", "10")
-        if parser._start_time >= OLDEST_WALL_S:
-            self.wall_start_ns = round(parser._start_time * 1e6) * 1000
+        start_s = parser._start_time
         parser._start_time = 0.0
+        if start_s >= OLDEST_WALL_S:
+            return round(start_s * 1e6) * 1000
+        return None
 
     def _frame(self, line: bytes) -> LogFrame | None:
         text = line.decode("ascii").strip()
