@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.cli import make_parser, say
+from kontronik_can_gw.cli.desk import watched
 from kontronik_can_gw.cli.output import check_output, configuration_files, writing
 from kontronik_can_gw.cli.recording import record_folder
 from kontronik_can_gw.config.parse import load
@@ -55,6 +56,8 @@ def write_parcel(
     with suppress(UserError):
         inputs = configuration_files(config)
     check_output(args.parcel, inputs, force=args.force)
+    if Path(args.parcel).exists() and not Path(args.parcel).is_file():
+        raise UserError(f"{args.parcel}: is not a regular file. Give another name.")
     made_ns = time.time_ns()
     contents = Contents(Cleaner(known_secrets(config)))
     _add_findings(contents, findings, report)
@@ -72,7 +75,7 @@ def write_parcel(
     else:
         unit = unit_of(machine, str(config.absolute()))
         folders = capture_folders(machine, config, unit, document)
-        add_captures(contents, folders, with_dbc=not args.without_dbc)
+        add_captures(contents, folders, with_dbc=not args.without_dbc, watch=_watched)
     with writing(args.parcel, force=args.force) as out:
         write_archive(out.open(), contents, made_ns)
         out.is_whole = True
@@ -80,6 +83,11 @@ def write_parcel(
         say(contents.cleaner.text(f"missing: {line}", "messages"), "doctor")
     say(f"{args.parcel} written. README.txt in it lists the removed secrets.", "doctor")
     return 0
+
+
+def _watched(data: Iterator[bytes], name: str) -> Iterator[bytes]:
+    """Show how much of a capture was read, because it may be large."""
+    return watched(data, f"{name}: bytes", data_on_screen=False)
 
 
 def _add_findings(

@@ -34,11 +34,12 @@ from kontronik_can_gw.desk.parcel.parts import Contents, add_journal
 from kontronik_can_gw.desk.parcel.secrets import Cleaner
 from kontronik_can_gw.desk.recordings.inputs import open_input
 
-SECRETS = ("hunter2", "c0rrect h0rse", "t0k3n", "c0mment", "s3ed", "p1ace")
+SECRETS = ("hunter2", "c0rrect h0rse", "t0k3n", "c0mment", "s3ed", "p1ace", "acc3ss", "pl4nt")
 CONFIGURATION = """# the broker's password: hunter2 (c0mment)
 [can]
 interface = "virtual"
 channel = "parcel"
+options.access_code = "acc3ss"
 [dbc]
 file = "car.dbc"
 [canopen]
@@ -61,6 +62,7 @@ def setup(tmp_path: Path) -> Path:
     """Return a configuration with secrets in it and in its DBC, EDS and captures."""
     dbc = shipped("dbc/kontronik_esc.dbc").read_text(encoding="latin-1")
     dbc += 'CM_ "c0mment";\nBA_DEF_ "SeedKey" STRING ;\nBA_DEF_DEF_ "SeedKey" "s3ed";\n'
+    dbc += 'BA_DEF_ "Plant" STRING ;\nBA_DEF_DEF_ "Plant" "pl4nt";\n'
     written(tmp_path / "car.dbc", dbc.encode("latin-1"))
     eds = shipped("eds/kontronik_esc.eds").read_bytes()
     written(tmp_path / "node.eds", eds + b"\n; c0mment\n")
@@ -175,6 +177,12 @@ def test_options_leave_out_captures_and_the_dbc(setup: Path) -> None:
 def test_an_existing_file_is_kept_without_force(setup: Path) -> None:
     path = written(setup.parent / "mine.zip", "x")
     assert "exists" in refused(2, "doctor", "-c", setup, "--parcel", path)
+    assert path.read_text() == "x"
+    link = setup.parent / "link.zip"
+    link.symlink_to(path)
+    assert "exists" in refused(2, "doctor", "-c", setup, "--parcel", link)
+    assert run("doctor", "-c", setup, "--parcel", link, "--force").code == 0
+    assert not link.is_symlink()
     assert path.read_text() == "x"
     assert "would overwrite" in refused(2, "doctor", "-c", setup, "--parcel", setup, "--force")
     assert "cannot be shown" in refused(2, "doctor", "-c", setup, "--parcel", "-")

@@ -27,10 +27,11 @@ _ABOUT = (
     ("versions.json", "versions, and SHA-256 digests of files"),
 )
 _STILL_INSIDE = """\
-Names of ESCs, ports, messages, signals and of this machine; the broker's host; paths of files. A
-capture reveals the use of the vehicle: it has all telemetry and all CAN frames that the gateway
-received. Leave captures out with --without-captures, and the DBC with --without-dbc. Warnings may
-name messages and signals of the DBC nevertheless.
+Names of ESCs, ports, messages, signals and of this machine; the broker's host; paths of files;
+names of options and attributes, without their values. A capture reveals the use of the vehicle: it
+has all telemetry and all CAN frames that the gateway received. Leave captures out with
+--without-captures, and the DBC with --without-dbc. Warnings may name messages and signals of the
+DBC nevertheless.
 Rules recognise secrets by their names, forms and values. Look through the files before you send
 them.
 """

@@ -1,15 +1,23 @@
 """Removes passwords, keys and comments from configurations, DBC files and EDS files. Pure.
 
+Only keys and attributes whose meaning is known keep their values. The options of a python-can
+interface and the attributes that a vehicle maker has invented may contain anything.
+
 People write passwords into comments, in any words. Comments change nothing that the gateway does,
 so all of them are removed. The number of lines stays, so that messages with line numbers fit.
 """
 
 import re
 import tomllib
+from dataclasses import fields
 
+from kontronik_can_gw.config.keys import TABLES
 from kontronik_can_gw.desk.parcel.secrets import REMOVED, Cleaner, is_secret_name
+from kontronik_can_gw.esc.value_names import normalize
 
 COMMENT = "comment"
+OPTIONS = ("can", "options")
+"""The table and the key of a python-can interface's options."""
 _TOML_TOKEN = re.compile(
     r"(?P<long>\"\"\".*?(?:\"\"\"|\Z)|'''.*?(?:'''|\Z))"
     r"|\"(?:[^\"\\\n]|\\[^\n])*\"|'[^'\n]*'|#(?P<comment>[^\n]*)",
@@ -17,7 +25,10 @@ _TOML_TOKEN = re.compile(
 )
 _TOML_NAME = r"(?:[\wÀ-ÿ-]+|\"[^\"\n]*\"|'[^'\n]*')"
 _TOML_KEY = re.compile(rf"\s*(?P<key>{_TOML_NAME}(?:[ \t]*\.[ \t]*{_TOML_NAME})*)[ \t]*=")
-_TOML_TABLE = re.compile(r"\s*\[\[?(?P<name>[\wÀ-ÿ .-]+)\]\]?\s*#?\s*$")
+_TOML_TABLE = re.compile(r"\s*\[\[?(?P<name>[\wÀ-ÿ .\"'-]+)\]\]?\s*#?\s*$")
+_OPTION_OF_RATE = re.compile(r"(?i).*(?:rate|timeout|delay|interval|size)")
+"""Names of interface options whose numbers are harmless."""
+_NUMBER = re.compile(r"[\d_.+-]+")
 _DBC_STRING = re.compile(r'"(?:\\"|[^"])*(?:"|\Z)|//[^\n]*|^[ \t]*(?:#|--|/\*)[^\n]*', re.MULTILINE)
 """A string, or a line that other formats would regard as a comment."""
 _DBC_NEXT = r"(?:(?!\n[ \t]*[A-Z][A-Z_]*_[ \t:])[^;])*;?"
@@ -27,6 +38,13 @@ _DBC_ATTRIBUTE = re.compile(
     r"\bBA_(?:DEF_)?(?:DEF_)?(?:REL_|SGTYPE_)?\s+(?:(?:BU_|BO_|SG_|EV_|BU_[A-Z]+_REL_)\s+)?"
     rf"\x00(?P<name>[0-9]+)\x01{_DBC_NEXT}"
 )
+_KNOWN_ATTRIBUTE = re.compile(
+    "gen(?:msg|sig|node|env).*|e2e.*|dataids?|dataidlist|sigfunctype|layoutversion|bustype"
+    "|protocoltype|vframeformat|baudrate.*|nm[a-z]*|diag(?:request|response|state)"
+    "|tp[a-z]*index|ilused|canfdbrs|multiplexextenabled|spn|sigtype"
+    "|system(?:message|signal|node|envvar)longsymbol"
+)
+"""Normalized names of attributes of Vector, SAE J1939 and AUTOSAR, and of this project."""
 _DBC_STATEMENT = re.compile(r"\s*(?:VERSION\b|[A-Z][A-Z_]*_\b|;|\x00|$)")
 _MASKED = re.compile(r"\x00([0-9]+)\x01")
 _EDS_SECTION = re.compile(r"\s*\[(?P<name>[^\]\n]*)\]")
@@ -52,15 +70,19 @@ def clean_toml(text: str, part: str, cleaner: Cleaner) -> str:
     lines = []
     is_hidden = False
     is_hidden_table = False
+    table_name = ""
     for line in _TOML_TOKEN.sub(token, text).split("\n"):
         table = _TOML_TABLE.match(line)
         entry = _TOML_KEY.match(line)
         if table is not None:
             is_hidden = False
-            is_hidden_table = is_secret_name(table["name"])
+            table_name = table["name"]
+            is_hidden_table = is_secret_name(table_name)
             lines.append(cleaner.forms(line, part))
         elif entry is not None:
-            is_hidden = is_hidden_table or is_secret_name(entry["key"])
+            value = line[entry.end() :].strip(" \t\r#")
+            is_harmless = _is_harmless(table_name, entry["key"], value)
+            is_hidden = is_hidden_table or is_secret_name(entry["key"]) or not is_harmless
             if is_hidden:
                 cleaner.count(part, entry["key"].strip())
                 lines.append(f'{entry[0]} "{REMOVED}"')
@@ -72,6 +94,23 @@ def clean_toml(text: str, part: str, cleaner: Cleaner) -> str:
     return "\n".join(lines)
 
 
+def _is_harmless(table: str, key: str, value: str) -> bool:
+    """Return True if the gateway knows a key, or its value cannot be a secret."""
+    path = [part.strip(" \t\"'") for part in f"{table}.{key}".strip(".").split(".")]
+    rows = () if path[0] not in TABLES else [row.name for row in fields(TABLES[path[0]])]
+    if len(path) > 1:
+        is_known = path[1] in rows and path[:2] != list(OPTIONS)
+    else:
+        is_known = path[0] in TABLES and OPTIONS[1] not in value
+    return is_known or is_harmless_option(path[-1], value)
+
+
+def is_harmless_option(name: str, value: str) -> bool:
+    """Return True if the value of an interface's option, as TOML, cannot be a secret."""
+    is_rate = _OPTION_OF_RATE.fullmatch(name) and _NUMBER.fullmatch(value)
+    return value in ("true", "false") or is_rate is not None
+
+
 def tables_of(text: str) -> dict[str, object]:
     """Return the tables of a configuration. Empty if it is not valid TOML."""
     try:
@@ -81,7 +120,7 @@ def tables_of(text: str) -> dict[str, object]:
 
 
 def clean_dbc(text: str, part: str, cleaner: Cleaner) -> str:
-    """Return a DBC file without comments, secret attributes, and secrets in its other texts."""
+    """Return a DBC file without comments, unknown attributes, and secrets in its other texts."""
     strings: list[str] = []
     comments = 0
 
@@ -100,7 +139,7 @@ def clean_dbc(text: str, part: str, cleaner: Cleaner) -> str:
 
     def without_attribute(found: re.Match[str]) -> str:
         name = strings[int(found["name"])].strip('"')
-        if not is_secret_name(name):
+        if _KNOWN_ATTRIBUTE.fullmatch(normalize(name)) and not is_secret_name(name):
             return found[0]
         cleaner.count(part, f"attribute {name}")
         return _blank(found[0], strings)

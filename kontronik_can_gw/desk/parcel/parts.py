@@ -19,7 +19,7 @@ from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import SHIPPED
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.desk.parcel.captures import clean_capture
-from kontronik_can_gw.desk.parcel.files import clean_dbc, clean_eds, clean_toml, tables_of
+from kontronik_can_gw.desk.parcel.files import OPTIONS, clean_dbc, clean_eds, clean_toml, tables_of
 from kontronik_can_gw.desk.parcel.secrets import Cleaner, values_of_secrets
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.native.objects import shared_object
@@ -134,7 +134,8 @@ def known_secrets(config: Path) -> dict[str, str]:
     except (OSError, UserError):
         return {}
     found: dict[str, str] = {}
-    for value, name in values_of_secrets(tables_of(text)):
+    tables = tables_of(text)
+    for value, name in (*values_of_secrets(tables), *_values_of_options(tables)):
         if name.endswith("_file") and _is_file(config.parent / value):
             if "password" in name:
                 found |= _first_line(config.parent / value, name)
@@ -142,6 +143,16 @@ def known_secrets(config: Path) -> dict[str, str]:
             found[value] = name
             found[Path(value).name] = name
     return found
+
+
+def _values_of_options(tables: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield the texts of the interface's options that may be secrets, each with its name."""
+    table, key = OPTIONS
+    options = tables.get(table)
+    options = options.get(key) if isinstance(options, dict) else None
+    for name, value in options.items() if isinstance(options, dict) else ():
+        if isinstance(value, str):
+            yield value, f"{table}.{key}.{name}"
 
 
 def _is_file(path: Path) -> bool:
@@ -215,8 +226,17 @@ def add_journal(contents: Contents, machine: Machine) -> None:
 # --- captures
 
 
-def add_captures(contents: Contents, folders: Iterable[Path], *, with_dbc: bool) -> None:
-    """Add the two newest captures in these folders."""
+def add_captures(
+    contents: Contents,
+    folders: Iterable[Path],
+    *,
+    with_dbc: bool,
+    watch: Callable[[Iterator[bytes], str], Iterator[bytes]] = lambda data, _: data,
+) -> None:
+    """Add the two newest captures in these folders.
+
+    The bytes that are read from a capture pass through ``watch`` together with its name.
+    """
     found: dict[tuple[int, str], Path] = {}
     places = list(dict.fromkeys(folders))
     before = len(contents.missing)
@@ -227,20 +247,26 @@ def add_captures(contents: Contents, folders: Iterable[Path], *, with_dbc: bool)
                     found[path.stat().st_mtime_ns, str(path)] = path
     for _, path in sorted(found.items(), reverse=True)[:_CAPTURES]:
         with contents.noting("captures"), path.open("rb"):
-            contents.parts.append(_capture(contents, path, with_dbc))
+            contents.parts.append(_capture(contents, path, with_dbc, watch))
     if not found and len(contents.missing) == before:
         where = ", ".join(map(str, places))
         reason = f"there is none in {where}" if where else "this configuration records none"
         contents.missing.append(f"captures: {reason}")
 
 
-def _capture(contents: Contents, path: Path, with_dbc: bool) -> Part:
+def _capture(
+    contents: Contents,
+    path: Path,
+    with_dbc: bool,
+    watch: Callable[[Iterator[bytes], str], Iterator[bytes]],
+) -> Part:
     name = f"captures/{_file_name(path)}"
 
     def chunks() -> Iterator[bytes]:
         contents.cleaner.begin(name)
         with path.open("rb") as file:
-            data = iter(lambda: file.read(_CHUNK), b"")
+            data: Iterator[bytes] = iter(lambda: file.read(_CHUNK), b"")
+            data = watch(data, name)
             yield from clean_capture(data, name, contents.cleaner, with_dbc=with_dbc)
 
     return Part(name, path.stat().st_size, chunks)
