@@ -3,8 +3,8 @@
 #   bootstrap.sh demo|lint|test|test-all|prove|pictures|wheels|release
 #   demo      the project
 #   lint      the same and its test tools
-#   test      the same and small tools of some tests. If the kernel has no vcan for this user, also
-#             User Mode Linux, which needs root or a sudo without a password.
+#   test      the same, a C compiler and small tools of some tests. If the kernel has no vcan for this
+#             user, also User Mode Linux.
 #   test-all  the same, User Mode Linux in any case, systemd, a browser, an MQTT broker, and CANopen
 #             masters of other projects (tests/foreign)
 #   prove     `lint` and a C compiler
@@ -13,6 +13,8 @@
 #   release   `test` and both virtual machines of the fault programme, which are User Mode Linux and
 #             QEMU with a kernel (90 MB); clang, cross compilers and their QEMU; debootstrap, lintian
 # A second call has no effect. PYTHON is the interpreter to use.
+# Debian packages are installed by root, or by a sudo without a password. For another user they are
+# unpacked in .venv/debian, and Zig of PyPI is the C compiler.
 set -eu
 
 what=${1:?demo, lint, test, test-all, prove, pictures, wheels or release}
@@ -40,6 +42,60 @@ apt_update() {
     as_root apt-get -qq -o DPkg::Lock::Timeout=120 update </dev/null >&2 || say "apt-get update: failed; going on"
     VM_APT_UPDATED=1
     export VM_APT_UPDATED
+}
+
+# Debian packages of a user who may not install them. They and the missing libraries are unpacked in
+# .venv/debian, by package lists of its own.
+debian=$PWD/.venv/debian
+own_apt() {
+    apt-get -qq -o Dir::State="$debian/state" -o Dir::State::status=/var/lib/dpkg/status \
+        -o Dir::Cache="$debian/cache" -o Debug::NoLocking=1 "$@" </dev/null >&2
+}
+
+unpack() { # packages
+    command -v apt-get >/dev/null && command -v dpkg-deb >/dev/null || return 1
+    if [ ! -e "$debian/root" ]; then
+        say "package lists, in .venv"
+        mkdir -p "$debian/state/lists/partial" "$debian/cache/archives/partial"
+        own_apt update || return 1
+        mkdir "$debian/root"
+    fi
+    say "unpacked in .venv: $*"
+    own_apt -y --no-install-recommends --download-only install "$@" >/dev/null 2>&1 || return 1
+    for archive in "$debian"/cache/archives/*.deb; do
+        [ -e "$archive" ] || continue
+        dpkg-deb -x "$archive" "$debian/root" || return 1
+        rm "$archive"
+    done
+    link_unpacked
+}
+
+# Puts the unpacked programs that the machine lacks in .venv/bin: a script for a program that needs
+# an unpacked library, a link for any other.
+link_unpacked() {
+    libraries=$(find "$debian/root" -path '*/lib/*-linux-gnu*/lib*.so*' -exec dirname {} + | sort -u | tr '\n' ':')
+    for program in "$debian"/root/bin/* "$debian"/root/sbin/* "$debian"/root/usr/bin/* "$debian"/root/usr/sbin/*; do
+        own=$PWD/.venv/bin/${program##*/}
+        [ -x "$program" ] && ! [ -e "$own" ] && ! command -v "${program##*/}" >/dev/null || continue
+        if ldd "$program" 2>/dev/null | grep -q 'not found'; then
+            printf '#!/bin/sh\nLD_LIBRARY_PATH="%s$LD_LIBRARY_PATH" exec "%s" "$@"\n' "$libraries" "$program" >"$own"
+            chmod 755 "$own"
+        else
+            ln -s "$program" "$own"
+        fi
+    done
+}
+
+# A C compiler from PyPI, for a user who may not install another one.
+unpack_compiler() {
+    say "a C compiler in .venv: Zig"
+    "$venv" -m pip install -q --disable-pip-version-check --no-input ziglang >&2 </dev/null || return 1
+    zig=$("$venv" -c 'import ziglang; print(ziglang.__path__[0])')/zig
+    for name in cc c++; do
+        printf '#!/bin/sh\nZIG_GLOBAL_CACHE_DIR="%s" exec "%s" %s -fno-sanitize=undefined "$@"\n' \
+            "$PWD/.venv/zig-cache" "$zig" $name >.venv/bin/$name
+        chmod 755 .venv/bin/$name
+    done
 }
 
 find_python() {
@@ -87,10 +143,10 @@ install_project() { # $1: demo or test, $2: what pip installs
     echo "$key" >"$stamp"
 }
 
-vm_packages="user-mode-linux can-utils iproute2 busybox-static gcc libc6-dev"
+vm_programs="user-mode-linux can-utils iproute2 busybox-static"
+vm_packages="$vm_programs gcc libc6-dev"
 vm_line="sudo apt-get install $vm_packages"
 
-# Programs that are installed already need no rights.
 # User Mode Linux 6.1 does not support the registers of the newest processors. It needs uml_xstate.c
 # to start there.
 uml_has_started() { # an earlier set-up has installed and tried User Mode Linux
@@ -102,7 +158,11 @@ install_uml() {
     uml_has_started && return
     for program in linux.uml busybox cc ip candump; do
         command -v $program >/dev/null && continue
-        can_root || { lacking "$vm_packages" "a kernel with vcan"; return 1; }
+        if ! can_root; then
+            command -v cc >/dev/null && unpack $vm_programs && break
+            lacking "$vm_packages" "a kernel with vcan"
+            return 1
+        fi
         apt_update
         say "User Mode Linux"
         tests/vm/setup.sh uml || { say "failed; by hand:  $vm_line"; return 1; }
@@ -119,10 +179,14 @@ install_uml() {
 install_vcan() {
     PATH=$PATH:/usr/sbin:/sbin
     if ! command -v ip >/dev/null || ! command -v candump >/dev/null; then
-        can_root || { lacking "$vm_packages" "a kernel with vcan"; return; }
-        apt_update
-        say "can-utils, iproute2"
-        tests/vm/setup.sh || { say "failed; by hand:  $vm_line"; return; }
+        if can_root; then
+            apt_update
+            say "can-utils, iproute2"
+            tests/vm/setup.sh || { say "failed; by hand:  $vm_line"; return; }
+        elif ! unpack can-utils iproute2; then
+            lacking "$vm_packages" "a kernel with vcan"
+            return
+        fi
     fi
     has_vcan && return
     uml_has_started && return
@@ -152,7 +216,8 @@ install_programs() {
     shift
     for each in "$@"; do command -v "${each%%=*}" >/dev/null || wanted="$wanted $(echo "${each#*=}" | tr , ' ')"; done
     [ -n "$wanted" ] || return 0
-    can_root || { lacking "$wanted" "$why"; return; }
+    can_root || unpack $wanted || lacking "$wanted" "$why"
+    can_root || return 0
     apt_update
     say "$why:$wanted"
     for package in $wanted; do
@@ -165,7 +230,7 @@ install_small_tools() {
     install_programs "what screens, completion and benchmarks are tried with" tmux zsh openssl jq
 }
 
-install_cpp() { install_programs "a C++ compiler" g++; }
+install_cpp() { command -v c++ >/dev/null || install_programs "a C++ compiler" g++; }
 
 install_file_systems() {
     install_programs "file systems after a loss of power" mkfs.ext4=e2fsprogs mkfs.f2fs=f2fs-tools mkfs.vfat=dosfstools
@@ -189,7 +254,11 @@ install_vm() { # $1: uml or qemu
 }
 
 # With a C compiler the C core is built when the project is installed. Otherwise the Python core runs.
-install_compiler() { command -v cc >/dev/null || command -v gcc >/dev/null || install_programs "a C compiler" gcc=gcc,libc6-dev; }
+install_compiler() {
+    command -v cc >/dev/null || command -v gcc >/dev/null && return
+    can_root || unpack_compiler && return
+    install_programs "a C compiler" gcc=gcc,libc6-dev
+}
 
 install_other_machines() {
     install_programs "the core in C on other machines" arm-none-eabi-gcc=gcc-arm-none-eabi,libnewlib-arm-none-eabi \
@@ -203,6 +272,7 @@ install_cross_compilers() {
 }
 
 [ -x "$venv" ] && "$venv" -c "$new_enough" 2>/dev/null || make_venv
+export PATH="$PWD/.venv/bin:$PATH"
 case $what in
     demo) install_project demo . ;;
     lint) install_project test '.[test]' ;;

@@ -35,7 +35,7 @@ _DELAY_S = 0.001
 
 def load_modules() -> None:
     """Load the modules of User Mode Linux, which loads nothing by itself."""
-    folder = Path("/usr/lib/uml/modules", os.uname().release)
+    folder = Path(Path("/run/job/modules").read_text().strip(), os.uname().release)
     for name in _MODULES + _CHARACTER_SETS:
         for file in folder.glob(f"kernel/**/{name}.ko"):
             subprocess.run(["busybox", "insmod", file], check=True)

@@ -1,8 +1,8 @@
-#!/usr/bin/busybox sh
-# Process 1 of both kinds of VM. The root is the host's / and read-only. VM_BACKEND and VM_JOB are set
-# on the kernel's command line. /run/job is the host's job folder with job.sh (the script to run), ro
-# and rw (folders to mount), and rc (the result).
-b=/usr/bin/busybox
+# Process 1 of both kinds of VM. vm_run.py copies it to the job folder, with a first line that names
+# busybox there. The root is the host's / and read-only. VM_BACKEND and VM_JOB are set on the kernel's
+# command line. /run/job is the host's job folder with busybox, job.sh (the script to run), modules
+# (UML's modules), ro and rw (folders to mount), and rc (the result).
+b=${0%/*}/busybox
 
 if [ "$VM_BACKEND" = uml ]; then
     $b mount -t proc proc /proc
@@ -11,12 +11,15 @@ fi
 $b mkdir -p /dev/pts /dev/shm
 $b mount -t devpts -o ptmxmode=666 devpts /dev/pts
 $b ln -sf /proc/self/fd /dev/fd
-for d in /dev/shm /tmp /var/tmp /run; do $b mount -t tmpfs tmpfs $d; done
+$b mount -t tmpfs tmpfs /run
 $b mkdir -p /run/job
 
 if [ "$VM_BACKEND" = uml ]; then
-    # Modules are not loaded automatically. Load all that may be needed, in order of dependency.
-    modules=/usr/lib/uml/modules/$($b uname -r)
+    $b mount -t hostfs -o "$VM_JOB" hostfs /run/job
+    # Modules are not loaded automatically. Load all that may be needed, in order of dependency. Their
+    # folder may be below /tmp.
+    read -r modules </run/job/modules
+    modules=$modules/$($b uname -r)
     names="can can-raw can-bcm can-gw can-isotp can-j1939 can-dev vcan vxcan slcan sch_tbf sch_netem"
     files=$($b grep -oE "^[^:]*/($(echo $names | $b tr ' ' '|'))\.ko[^:]*" "$modules/modules.dep")
     for m in $names; do
@@ -29,7 +32,6 @@ if [ "$VM_BACKEND" = uml ]; then
             $b insmod "$f" || echo "insmod $m: failed"
         done
     done
-    $b mount -t hostfs -o "$VM_JOB" hostfs /run/job
     bind() { $b mkdir -p "$2" && $b mount -t hostfs -o "$1,$2" hostfs "$2"; }
     for t in 0 1; do $b stty -F /dev/ttyS$t raw; done
     out=/dev/ttyS0 err=/dev/ttyS1
@@ -46,6 +48,8 @@ else
     done
     out=/dev/virtio-ports/stdout err=/dev/virtio-ports/stderr
 fi
+b=/run/job/busybox # the next line hides the job folder in /var/tmp
+for d in /dev/shm /tmp /var/tmp; do $b mount -t tmpfs tmpfs $d; done
 while read -r d; do bind ro "$d" || echo "mount $d: failed"; done </run/job/ro
 while read -r d; do bind rw "$d" || echo "mount $d: failed"; done </run/job/rw
 

@@ -56,7 +56,7 @@ done
 [ -z "$missing" ] || install $missing
 if [ $xstate = yes ]; then
     mkdir -p "$cache"
-    gcc -O2 -Wall -shared -fPIC -o "$cache/uml_xstate.so" "$here/uml_xstate.c" -ldl
+    cc -O2 -Wall -shared -fPIC -o "$cache/uml_xstate.so" "$here/uml_xstate.c" -ldl
 fi
 [ $qemu = yes ] || exit 0
 

@@ -153,6 +153,12 @@ def uml_host_environment(job: str) -> dict[str, str]:
     return {"TMPDIR": uml_memory_folder(job), "LD_PRELOAD": ":".join(preload)}
 
 
+def uml_modules() -> Path:
+    """Return the folder of UML's modules. It is beside the program, which may be a link."""
+    program = Path(shutil.which("linux.uml") or "/usr/bin/linux.uml").resolve()
+    return program.parents[1] / "lib/uml/modules"
+
+
 def uml_memory_folder(job: str) -> str:
     """Return the folder of UML's memory file.
 
@@ -262,11 +268,16 @@ def write_job(
         os.path.dirname(os.path.abspath(command[0])),
     }
     hidden = sorted(folder for folder in needed if under_tmpfs(folder) and folder not in TMPFS)
-    for name, content in (("job.sh", lines), ("ro", hidden), ("rw", writable)):
+    modules = [str(uml_modules())]
+    files = (("job.sh", lines), ("modules", modules), ("ro", hidden), ("rw", writable))
+    for name, content in files:
         with open(os.path.join(job, name), "w") as file:
             file.writelines(line + "\n" for line in content)
     # The script is copied, because the kernel's command line cannot contain a path with a blank.
-    shutil.copy(os.path.join(HERE, "guest-init.sh"), job)
+    shutil.copy(shutil.which("busybox") or "busybox", job)
+    init = Path(job, "guest-init.sh")
+    init.write_text(f"#!{job}/busybox sh\n{Path(HERE, 'guest-init.sh').read_text()}")
+    init.chmod(0o755)
 
 
 def pump(fd: int, to: BinaryIO) -> None:
@@ -418,7 +429,7 @@ def run_in_vm(
 
 def installed() -> list[str]:
     """Return the kinds of VM that can be tried, the better one first."""
-    if not os.path.exists("/usr/bin/busybox"):
+    if not shutil.which("busybox"):
         return []
     vms = []
     if shutil.which("linux.uml") and shutil.which("cc"):
