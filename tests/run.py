@@ -70,23 +70,29 @@ PATH = os.pathsep.join(
 MESSAGE = 2000
 """Characters of a failed test's message in the summary, for readers of only the output's end."""
 
+LIMIT_AS_STEP = "--timeout=0 -o faulthandler_timeout=0"
+"""For long tests: only the limit of the whole step ends a test."""
+LIMIT_OF_VCAN = "--timeout=20000 -o faulthandler_timeout=0"
+"""In virtual time, which passes at once while a test waits."""
 PYTEST = "python -m pytest -q --junitxml={report}"
 ON_VCAN = (
     "KCG_VCAN=1 HYPOTHESIS_STORAGE_DIRECTORY={scratch} "
     "python tests/vm/vm_run.py --timeout=1500 --rw={scratch} -- "
-    f"{PYTEST} -p no:cacheprovider tests/vcan"
+    f"{PYTEST} -p no:cacheprovider tests/vcan {LIMIT_OF_VCAN}"
 )
 ELSEWHERE = "--ignore=tests/vcan --ignore=tests/proofs"
 """Folders with steps of their own."""
-FUZZ_OPTIONS = "-s -o faulthandler_timeout=900"
+FUZZ_OPTIONS = f"-s {LIMIT_AS_STEP}"
 PROOF = (
-    "python -m pytest -q -s --junitxml={{report}} -o faulthandler_timeout=3600 "
-    "tests/proofs/{0} {{args}}"
+    "python -m pytest -q -s --junitxml={{report}} "
+    f"{LIMIT_AS_STEP} tests/proofs/{{0}} {{{{args}}}}"
 )
+LIMIT_OF_TOOLS = "--timeout=1500 -o faulthandler_timeout=1800"
+"""A virtual machine of one test may run for 1200 s."""
 FAULTS = "python tests/faults/programme.py {0} --junit={{report}}"
 PLUG = (
     "KCG_PLUG_STATES={0} python -m pytest -q -s --junitxml={{report}} "
-    "-o faulthandler_timeout=18000 tests/plug/power_cuts.py {{args}}"
+    f"{LIMIT_AS_STEP} tests/plug/power_cuts.py {{{{args}}}}"
 )
 STEPS = {
     "lint": "ruff check . && ruff format --check .",
@@ -94,7 +100,7 @@ STEPS = {
     "unit": f"{PYTEST} -n logical --maxprocesses=8 -m 'not extended' {ELSEWHERE} {{args}}",
     "vcan": f"{ON_VCAN} -m 'not extended' {{args}}",
     "faults": FAULTS.format("uml"),
-    "tools": f"{PYTEST} -m 'extended or rights' {ELSEWHERE} {{args}}",
+    "tools": f"{PYTEST} {LIMIT_OF_TOOLS} -m 'extended or rights' {ELSEWHERE} {{args}}",
     "masters": f"{ON_VCAN} -m extended {{args}}",
     "prove": f"{PYTEST} -n 2 tests/proofs {{args}}",
     "cuts": PLUG.format(200),
@@ -112,7 +118,7 @@ STEPS = {
     "eva": PROOF.format("long_eva.py"),
     "worst": PROOF.format("long_worst_case.py"),
     "years": "python tests/proofs/years_run.py {args}",
-    "deb": f"{PYTEST} -o faulthandler_timeout=900 tests/deb/in_fresh_roots.py",
+    "deb": f"{PYTEST} {LIMIT_AS_STEP} tests/deb/in_fresh_roots.py",
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),

@@ -54,6 +54,39 @@ def test_a_test_that_asks_for_a_compiler_can_use_it(
     assert subprocess.run([tmp_path / "seven"], check=False).returncode == 7
 
 
+@pytest.mark.parametrize(
+    ("hangs", "options", "name"),
+    [
+        ("while True: pass", ["--timeout=1"], "FAILED test_two.py::test_hangs - Failed: Timeout"),
+        (
+            "sum(itertools.repeat(0))",
+            ["-n1", "-o", "faulthandler_timeout=1"],
+            "crashed while running 'test_two.py::test_hangs'",
+        ),
+    ],
+    ids=["in Python", "in C"],
+)
+def test_a_test_that_hangs_is_named_and_the_next_one_runs(
+    hangs: str,
+    options: list[str],
+    name: str,
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "test_two.py").write_text(
+        f"import itertools\ndef test_hangs():\n    {hangs}\ndef test_next():\n    pass\n"
+    )
+    settings = ["-c", str(TESTS.parent / "pyproject.toml"), "--rootdir", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", *settings, *options, "test_two.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert name in done.stdout, done.stdout + done.stderr
+    assert "1 failed, 1 passed" in done.stdout
+
+
 def test_children_of_tests_have_default_signals_under_nohup() -> None:
     script = "import conftest, subprocess; subprocess.run(['cat', '/proc/self/status'])"
     done = run_ignoring(script)

@@ -1,11 +1,11 @@
 """The output of ``check`` as text and as JSON, and the places of an unnamed configuration."""
 
 import json
-import os
 from pathlib import Path
 
 import pytest
 from command_line import refused, run, written
+from rights import modes_apply
 
 from kontronik_can_gw.cli import arguments
 
@@ -119,20 +119,13 @@ def test_an_unreadable_file_is_reported_in_one_line(
     words: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Root may read every file, so the test gives up its rights while the command runs."""
     own, _ = places
     monkeypatch.setattr(arguments, "CONFIG_PLACES", (own,))
     written(own, LEAST)
-    run(*words.split())  # imports modules while they can be read
     own.parent.chmod(0)
-    user = os.geteuid()
-    if user == 0:
-        os.seteuid(65534)
-    try:
+    with modes_apply(own.parent):
         said = refused(code, *words.split())
-    finally:
-        os.seteuid(user)
-        own.parent.chmod(0o700)
+    own.parent.chmod(0o700)
     assert "Permission denied" in said
 
 

@@ -1,11 +1,11 @@
 """The same mistake has the same exit code in every command, and one line that names the file."""
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from command_line import run, written
+from rights import modes_apply
 
 CONFIGURATION = (
     '[can]\ninterface = "virtual"\n[mqtt]\nbroker = "localhost"\n[[esc]]\nport = "nowhere"\n'
@@ -83,20 +83,14 @@ def folder(tmp_path: Path, recording: bytes, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.fixture
 def no_rights(folder: Path) -> Iterator[None]:
-    """Run a command while nothing in the folder can be opened or created.
-
-    Root gives up its rights during this time.
-    """
+    """Run a command while nothing in the folder can be opened or created."""
     for words in ("describe", "convert x.bin - --to csv", "replay x.bin --on pty --delay 0"):
         run(*words.split())  # imports modules while they can be read
-    user = os.geteuid()
     for path in folder.iterdir():
         path.chmod(0)
     folder.chmod(0o555)
-    if user == 0:
-        os.seteuid(65534)
-    yield
-    os.seteuid(user)
+    with modes_apply(folder):
+        yield
     folder.chmod(0o700)
 
 

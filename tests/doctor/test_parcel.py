@@ -13,13 +13,13 @@ import tempfile
 import tomllib
 import zipfile
 from collections.abc import Iterator
-from encodings import cp437  # noqa: F401  a user without rights cannot load it later
 from pathlib import Path
 
 import pytest
 from capture_bench import Bench, capture, capture_file, made
 from command_line import Done, refused, run, written
 from doctor_trees import Tree
+from rights import modes_apply
 
 from kontronik_can_gw.assembly.assemble import load_configuration
 from kontronik_can_gw.capture.format import SUFFIX, Block, EntryKind, Scanner, block, read_json
@@ -302,11 +302,10 @@ def test_a_limit_of_the_system_for_files_leaves_out_captures(setup: Path) -> Non
 
 @pytest.mark.rights
 def test_without_rights_each_unreadable_part_is_one_line(setup: Path) -> None:
-    """Root is not stopped by file modes, so as root this runs as another user for a while."""
     with tempfile.TemporaryDirectory() as place, as_another_user(Path(place), setup) as file:
         file.chmod(0o600 if os.geteuid() != file.stat().st_uid else 0)
         closed = file.parent / "captures"
-        with as_nobody():
+        with modes_apply(Path(place)):
             done = run("doctor", "-c", file, "--parcel", f"{place}/out/parcel.zip")
             files = opened(Path(place, "out/parcel.zip"))
         closed.chmod(0o700)
@@ -324,18 +323,6 @@ def as_another_user(place: Path, setup: Path) -> Iterator[Path]:
     (place / "out").mkdir()
     (place / "out").chmod(0o777)
     yield place / "setup" / setup.name
-
-
-@contextlib.contextmanager
-def as_nobody() -> Iterator[None]:
-    if os.geteuid() != 0:
-        yield
-        return
-    os.seteuid(65534)
-    try:
-        yield
-    finally:
-        os.seteuid(0)
 
 
 # --- journal
