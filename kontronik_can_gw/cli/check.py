@@ -81,6 +81,9 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     yield f"  CAN       {can.channel} ({can.interface}), {rate}"
     if can.quiet_after_s:
         yield f"            quiet after {can.quiet_after_s} s without telemetry"
+    if can.restart_after_s and can.interface == "socketcan":
+        yield f"            restarted after {can.restart_after_s:g} s in which no frame has left,"
+        yield "            if root or the service's user runs the gateway"
     if config.dbc.enabled:
         keys = sorted((each.extended, each.can_id) for each in loaded.layout.messages)
         ids = [f"{can_id:08X}h" if extended else f"{can_id:03X}h" for extended, can_id in keys]

@@ -1,6 +1,8 @@
 """Requests to restart an interface from which no frame leaves: times, numbers, log lines."""
 
 import logging
+import os
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,12 +11,15 @@ from test_can_link import ACTIVE, Bench, Kernel, kernel, locks_of_its_own  # noq
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.runtime.can.interface_restart import (
+    FOLDER,
     MAX_PAUSE_NS,
     InterfaceRestart,
+    remedy,
     request,
     request_file,
 )
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
+from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.times import MS, SECOND
 
@@ -157,6 +162,59 @@ def test_a_request_changes_the_file_of_the_interface(tmp_path: Path) -> None:
     request("can7")
     assert request_file("can7").stat().st_mtime_ns >= first
     assert request_file("can7").read_bytes() == b""
+
+
+def _link_to_a_file(path: Path, target: Path) -> None:
+    target.write_text("content")
+    path.symlink_to(target)
+
+
+def _link_to_no_file(path: Path, target: Path) -> None:
+    path.symlink_to(target)
+
+
+def _fifo(path: Path, _target: Path) -> None:
+    os.mkfifo(path)
+
+
+def _link_of_the_folder(path: Path, target: Path) -> None:
+    path.parent.rmdir()
+    target.mkdir()
+    path.parent.symlink_to(target)
+
+
+@pytest.mark.parametrize("make", [_link_to_a_file, _link_to_no_file, _fifo, _link_of_the_folder])
+def test_a_request_opens_only_a_regular_file(
+    tmp_path: Path,
+    make: Callable[[Path, Path], None],
+) -> None:
+    """The folder belongs to the service's user, and the gateway may run as root."""
+    path = request_file("can7")
+    path.parent.mkdir(parents=True)
+    target = tmp_path / "target"
+    make(path, target)
+    before = target.read_text() if target.is_file() else sorted(tmp_path.rglob("*"))
+    request("can7")
+    assert before == (target.read_text() if target.is_file() else sorted(tmp_path.rglob("*")))
+    if make is not _link_of_the_folder:
+        assert f"{path}: it is not a regular file. Remove it" in remedy("can7")
+
+
+def test_an_ordinary_user_is_told_that_nobody_follows_the_request(
+    kernel: Kernel,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    it = Hung(kernel)
+    request("can0")
+    it.run(5, restarts=False)
+    assert "Enable the unit: sudo systemctl enable --now" in caplog.text
+    it.restart = InterfaceRestart(CanConfig(restart_after_s=0.5), it.gateway, FaultLog(), it._ask)
+    caplog.clear()
+    monkeypatch.setattr(folders, "is_of_service", lambda purpose: purpose != FOLDER)
+    it.run(5, restarts=False)
+    assert "Only gateways of root and of the service's user can request a restart" in caplog.text
+    assert "Enable the unit" not in caplog.text
 
 
 @pytest.mark.parametrize(("restart_ms", "is_asked"), [(0, True), (100, False)])

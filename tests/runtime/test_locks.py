@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,23 @@ def test_a_lock_is_exclusive_until_it_is_released(folder: Path) -> None:
     assert second.hold(NODES[:1]) == []
     second.close()
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("target")])
+def test_a_lock_is_a_regular_file(
+    folder: Path,
+    make: Callable[[Path], object],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Another program of the service's user may have created anything in its place."""
+    path = folder / file_name(NODES[0])
+    folder.mkdir(parents=True)
+    make(path)
+    locks = Locks()
+    assert locks.hold(NODES[:1]) == []
+    assert f"{folder}: it is not a regular file. A second gateway could use" in caplog.text
+    assert [each.name for each in folder.iterdir()] == [path.name]
+    locks.close()
 
 
 def test_a_lock_file_that_its_holder_removes_is_created_again(

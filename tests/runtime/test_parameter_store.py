@@ -103,6 +103,18 @@ def test_saving_is_refused_if_no_thread_can_be_started(
 # --- damage
 
 
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("target")])
+def test_a_file_that_is_not_regular_is_neither_read_nor_awaited(
+    tmp_path: Path,
+    store: ParameterStore,
+    make: Callable[[Path], object],
+) -> None:
+    path = place(tmp_path, OLD) / "esc1.params"
+    path.rename(path.with_name("target"))
+    make(path)
+    assert store.load("esc1", bytes) == (None, f"{path}: it is not a regular file")
+
+
 def place(tmp_path: Path, data: bytes) -> Path:
     folder = tmp_path / "params"
     folder.mkdir(exist_ok=True)
@@ -145,11 +157,11 @@ def test_an_unreadable_file_is_kept_and_half_a_new_file_is_never_read(
     folder = place(tmp_path, OLD)
     (folder / "esc1.params.tmp").write_bytes(NEW)
 
-    def fail(_path: Path) -> bytes:
+    def fail(_path: Path, _flags: int) -> int:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "read_bytes", fail)
+        patched.setattr("kontronik_can_gw.runtime.files.store.open_regular", fail)
         stored, reason = store.load("esc1", decode)
     assert stored is None
     assert reason

@@ -7,6 +7,7 @@ from typing import Any
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.doctor import Finding, Findings
 from kontronik_can_gw.desk.doctor.machine import Machine
+from kontronik_can_gw.runtime.can.interface_restart import RIGHTS
 from kontronik_can_gw.runtime.can.link_commands import (
     VIRTUAL,
     add_virtual,
@@ -83,7 +84,7 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
     if can.restart_after_s and not virtual:
         watched = f"multi-user.target.wants/kontronik-can-gw-restart@{can.channel}.path"
         is_enabled = machine.target_of(f"/etc/systemd/system/{watched}")
-        findings.add("can.restart_unit", "ok" if is_enabled else "off")
+        findings.add("can.restart_unit", "ok" if is_enabled else "off", rights=RIGHTS)
     return findings.found
 
 

@@ -6,17 +6,20 @@ interface is that of the unit's instance. The content of the file does not matte
 """
 
 import contextlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.runtime.files.disk import open_regular, reason_of
 from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.times import NEVER, SECOND
 
 FOLDER = "restart"
 """Name of the folder of the requests, which has a file for each interface."""
+RIGHTS = "Only gateways of root and of the service's user can request a restart"
 MAX_PAUSE_NS = 10 * SECOND
 ANSWER_NS = 2 * SECOND
 """An interface that goes down within this time after a request is restarted because of it."""
@@ -31,7 +34,25 @@ def request(channel: str) -> None:
     """Request a restart. Does nothing if the file cannot be written."""
     with contextlib.suppress(OSError):
         folders.make_runtime_folder(FOLDER)
-        request_file(channel).write_bytes(b"")
+        # closing a file that was opened for writing is a change for systemd
+        os.close(open_regular(request_file(channel), os.O_WRONLY | os.O_CREAT))
+
+
+def remedy(channel: str) -> str:
+    """Return what to do if the requests for an interface have no effect."""
+    if not folders.is_of_service(FOLDER):
+        return (
+            f"{RIGHTS}: install the service with sudo kontronik-can-gw service install, "
+            "or start the gateway as root."
+        )
+    path = request_file(channel)
+    try:
+        os.close(open_regular(path, os.O_RDONLY))
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        return f"{path}: {reason_of(error)}. Remove it."
+    return f"Enable the unit: sudo systemctl enable --now kontronik-can-gw-restart@{channel}.path"
 
 
 class InterfaceRestart:
@@ -82,10 +103,7 @@ class InterfaceRestart:
         if self._is_pending and now - self._requested_ns > ANSWER_NS:
             self._is_pending = False
             self._double(max(self._pause_ns, ANSWER_NS))
-            text = (
-                f"CAN {self._channel}: the interface was not restarted. Enable the unit: "
-                f"sudo systemctl enable --now kontronik-can-gw-restart@{self._channel}.path"
-            )
+            text = f"CAN {self._channel}: the interface was not restarted. {remedy(self._channel)}"
             self._conditions.begin(self.condition, text, now)
         if self._is_pending or now - max(outage_since, self._requested_ns) < self._pause_ns:
             return

@@ -1,8 +1,36 @@
 """Functions for the threads that write files."""
 
+import errno
 import fcntl
 import os
+import stat
 from pathlib import Path
+
+_OTHER_FILES = (errno.ELOOP, errno.ENXIO, errno.EISDIR)
+"""Errors of open for a symbolic link, a FIFO without a reader or a socket, and a folder."""
+
+
+def open_regular(path: Path, flags: int, mode: int = 0o600) -> int:
+    """Open a regular file, and return its descriptor. Never waits and never follows a link.
+
+    Every file that the gateway writes, and that another user could replace, is opened by this
+    function. Raises OSError if it is not a regular file. Intermediate folders may be links.
+    """
+    flags |= os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+    try:
+        fd = os.open(path, flags, mode)
+    except OSError as error:
+        if error.errno in _OTHER_FILES:
+            raise _not_regular(error.errno) from None
+        raise
+    if stat.S_ISREG(os.fstat(fd).st_mode):
+        return fd
+    os.close(fd)
+    raise _not_regular(errno.EINVAL)
+
+
+def _not_regular(number: int) -> OSError:
+    return OSError(number, "it is not a regular file")
 
 
 def write_all(fd: int, data: bytes) -> None:
@@ -17,12 +45,12 @@ def write_new(path: Path, data: bytes, mode: int, is_synced: bool = False) -> No
 
     With ``is_synced``, the content is forced to the disk. Raises OSError if that fails.
     """
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     try:
-        fd = os.open(path, flags, mode)
+        fd = open_regular(path, flags, mode)
     except FileExistsError:
         path.unlink()
-        fd = os.open(path, flags, mode)
+        fd = open_regular(path, flags, mode)
     try:
         os.fchmod(fd, mode)  # os.open applies the umask to the mode
         write_all(fd, data)
@@ -54,8 +82,8 @@ def reason_of(error: Exception) -> str:
 def is_locked(path: Path) -> bool:
     """Return True if this or another process has locked the file with flock."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError:  # the file was removed
+        fd = open_regular(path, os.O_RDONLY)
+    except OSError:  # the file was removed, or it is not a file of a gateway
         return False
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -37,7 +37,13 @@ from kontronik_can_gw.capture.recorded_gateway import devices_of, state_of
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.files.disk import is_locked, reason_of, sync_folder, write_all
+from kontronik_can_gw.runtime.files.disk import (
+    is_locked,
+    open_regular,
+    reason_of,
+    sync_folder,
+    write_all,
+)
 from kontronik_can_gw.runtime.system.clock import ClockFacts
 from kontronik_can_gw.runtime.system.worker import Report, Worker
 from kontronik_can_gw.times import MS, SECOND
@@ -386,8 +392,7 @@ class CapturePart:
         """Number of bytes written since the last ``sync``."""
         self._header: bytes | None = header
         """The header until it has been written a second time."""
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        self._fd = os.open(self.path, flags, 0o640)
+        self._fd = open_regular(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o640)
         try:
             with contextlib.suppress(OSError):  # some file systems have no locks
                 fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.runtime.files.disk import reason_of, sync_folder, write_new
+from kontronik_can_gw.runtime.files.disk import open_regular, reason_of, sync_folder, write_new
 from kontronik_can_gw.runtime.system.locks import Taken, lock_file
 from kontronik_can_gw.runtime.system.worker import Handover, Worker
 
@@ -75,7 +75,9 @@ class ParameterStore:
         with contextlib.suppress(OSError):
             _temporary(path).unlink()
         try:
-            return decode(path.read_bytes()), None
+            with os.fdopen(open_regular(path, os.O_RDONLY), "rb") as file:
+                data = file.read()
+            return decode(data), None
         except FileNotFoundError:
             return None, None
         except OSError as error:

@@ -35,6 +35,11 @@ def runtime_folder(purpose: str) -> Path:
     return last / purpose
 
 
+def is_of_service(purpose: str) -> bool:
+    """Return True if ``runtime_folder`` is shared with the service, and units watch it."""
+    return runtime_folder(purpose) == RUN / NAME / purpose
+
+
 def make_runtime_folder(purpose: str) -> Path:
     """Create the folder of ``runtime_folder`` if it is missing. OSError if it cannot be used."""
     folder = runtime_folder(purpose)
@@ -44,6 +49,8 @@ def make_runtime_folder(purpose: str) -> Path:
         if not _is_own(folder.parent):
             raise OSError(0, f"{folder.parent} belongs to another user or is not a folder")
     folder.mkdir(mode=0o755, parents=True, exist_ok=True)
+    if folder.is_symlink():
+        raise OSError(0, f"{folder} is a symbolic link. Remove it")
     return folder
 
 

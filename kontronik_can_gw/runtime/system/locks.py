@@ -18,7 +18,7 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import ids_in_words
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.files.disk import reason_of
+from kontronik_can_gw.runtime.files.disk import open_regular, reason_of
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.runtime.system.folders import make_runtime_folder, runtime_folder
 from kontronik_can_gw.status import UNCONFIGURED
@@ -53,7 +53,7 @@ def lock_file(path: Path) -> int:
     Raises Taken if another process holds the lock, and OSError if the file cannot be opened. A
     file that root creates can also be opened by the folder's group, which is the service's group.
     """
-    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    fd = open_regular(path, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.geteuid() == 0:
