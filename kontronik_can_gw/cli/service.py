@@ -326,7 +326,7 @@ def _uninstall(root: Path, *, staged: bool) -> None:
 
 def _without_program(unit: str) -> str:
     """Return the text of a unit without the program that it starts."""
-    return re.sub(r"(?m)^ExecStart=\S*", "ExecStart=", unit)
+    return re.sub(r"(?m)^(ExecStart=(?:/bin/sh .* sh )?)\S*", r"\1", unit)
 
 
 # --- tools

@@ -163,7 +163,7 @@ def test_the_package_has_units_rules_completion_and_manual(made: dict[str, bytes
             name = f"kontronik-can-gw{kind}{instance}.service"
             unit = text(package, f"./usr/lib/systemd/system/{name}")
             assert unit.startswith("[Unit]\n")
-            start = "^ExecStart=/usr/bin/kontronik-can-gw (run|mqtt|metrics) "
+            start = "^ExecStart=(/bin/sh .* )?/usr/bin/kontronik-can-gw (run|mqtt|metrics) "
             assert re.search(start, unit, re.MULTILINE)
             assert re.search("@[A-Z]+@", unit) is None
     for name in (

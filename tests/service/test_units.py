@@ -4,8 +4,10 @@ import ast
 import ipaddress
 import os
 import re
+import shlex
 import shutil
 import subprocess
+import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -258,7 +260,8 @@ def allowed_families(unit: str) -> set[str]:
 @pytest.mark.parametrize("name", EVERY)
 def test_a_unit_permits_the_socket_families_that_its_command_opens(name: str) -> None:
     unit = files()[name]
-    command = settings(unit)["ExecStart"][0].split()[1]
+    (line,) = settings(unit)["ExecStart"]
+    command = line.partition("/bin/true ")[2].split()[0]
     modules = reachable(command)
     if command == "metrics":
         # The modules that it shares with other commands open no socket there.
@@ -268,6 +271,17 @@ def test_a_unit_permits_the_socket_families_that_its_command_opens(name: str) ->
         # Without rtnetlink its advice on a missing interface has no bit rate.
         named.remove("AF_NETLINK")
     assert allowed_families(unit) == named | IN_LIBRARIES[command]
+
+
+def test_signal_usr1_does_not_end_the_gateway_while_the_interpreter_starts() -> None:
+    """The shell of the unit starts a program with the signal ignored, and with all its words."""
+    (line,) = settings(files()[NAMES[0]])["ExecStart"]
+    words = shlex.split(line.replace("$$", "$").replace("/bin/true", sys.executable))
+    at = words.index(sys.executable)
+    code = "import os, signal, sys; os.kill(os.getpid(), signal.SIGUSR1); print(sys.argv[1:])"
+    program = [*words[: at + 1], "-c", code, *words[at + 1 :]]
+    done = subprocess.run(program, capture_output=True, text=True, check=True)
+    assert done.stdout == f"{words[at + 1 :]}\n"
 
 
 def test_the_gateway_may_use_only_can_rtnetlink_and_the_notify_socket() -> None:
