@@ -47,10 +47,31 @@ def password(file: str) -> str:
     return line
 
 
-class _Client(paho.Client):
-    """paho's client. Its thread continues after the exceptions of malformed packets."""
+_EXPECTED = (0x20, 0x40, 0xD0)
+"""First bytes of the packets that a publisher receives: CONNACK, PUBACK and PINGRESP."""
+_LARGEST_BODY = 2
+"""Bytes after the length of such a packet."""
 
-    on_malformed: Callable[[], None]
+
+class _Unexpected(Exception):
+    """Raised if the broker begins a packet that no publisher receives."""
+
+
+class _Client(paho.Client):
+    """paho's client. Its thread continues after the exceptions of malformed packets.
+
+    It has no subscription, so a broker only answers. paho would accept a packet of any size up to
+    256 MB, and would answer a flood of others before anything else.
+    """
+
+    on_malformed: Callable[[str], None]
+
+    def _sock_recv(self, size: int) -> bytes:
+        """Receive at most ``size`` bytes of one packet: its first byte, its length, its body."""
+        command = self._in_packet["command"]
+        if size > _LARGEST_BODY or (command and command not in _EXPECTED):
+            raise _Unexpected
+        return super()._sock_recv(size)
 
     def loop_forever(
         self, timeout: float = 1.0, retry_first_connection: bool = False
@@ -59,8 +80,12 @@ class _Client(paho.Client):
         while True:
             try:
                 return super().loop_forever(timeout, retry_first_connection)
-            except Exception:
-                self.on_malformed()
+            except Exception as error:
+                if isinstance(error, _Unexpected):
+                    problem = "sends packets that no publisher expects"
+                else:
+                    problem = "its answer is not MQTT"
+                self.on_malformed(f"{problem}. Is this the port of an MQTT broker?")
                 sock = self.socket()
                 if sock is not None:
                     with contextlib.suppress(OSError):
@@ -233,8 +258,8 @@ class MqttClient:
         self._ended.clear()
         self.problem = ""
 
-    def _on_malformed(self) -> None:
-        self.problem = "its answer is not MQTT. Is this the port of an MQTT broker?"
+    def _on_malformed(self, problem: str) -> None:
+        self.problem = problem
 
     def _on_connect_fail(self, *_: object) -> None:
         error = sys.exc_info()[1]
