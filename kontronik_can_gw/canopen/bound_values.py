@@ -127,7 +127,7 @@ def _stored(variable: Variable) -> EscValue:
         variable.entry.name,
         "",
         Group.GATEWAY,
-        Kind.GATEWAY,
+        Kind.OBJECT,
         read=read,
     )
 

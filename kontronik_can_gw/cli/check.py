@@ -13,6 +13,7 @@ from kontronik_can_gw.cli.recording import events_in_words, in_words, record_fol
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.dbc.reader import listed
 from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import UNCONFIGURED
@@ -104,6 +105,9 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
         yield f"  captures  {in_words(config, folder)}"
         if config.record.on_event:
             yield f"            {events_in_words(config)}"
+    yield f"  core      {shown['core']}"
+    if shown["core_reason"]:
+        yield f"            {shown['core_reason']}"
     load = shown["bus_load"]
     frames = shown["frames_per_second"]
     yield f"  bus load  {load:.1%}, {frames:.0f} frames/s: ESCs at 100 Hz, worst stuffing, no SDO"
@@ -159,6 +163,7 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
         more, bits = output.traffic(is_worst=True)
         worst += bits / can.bitrate
         worst_frames += more
+    core, why_python = make_core(loaded.escs, layout, 0, config.dbc.silent_on_loss)
     node_ids: list[int | None] = []
     setup = canopen_setup(loaded)
     if setup is not None:
@@ -189,5 +194,7 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
         },
         "outputs": {each.name: lines for each in loaded.outputs if (lines := each.lines())},
         "canopen_nodes": node_ids,
+        "core": core.language,
+        "core_reason": why_python or None,
         "record_ring_bytes": ring_size(config),
     }

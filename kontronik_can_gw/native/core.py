@@ -14,6 +14,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, SlotRow, held_settings
+from kontronik_can_gw.native.scale import rescaled
 from kontronik_can_gw.native.slots import (
     NativeSlot,
     Place,
@@ -110,6 +111,7 @@ class NativeCore:
     def _make(self, tables: Tables, now: int) -> None:
         """Start the core. ``state``, ``esc_states``, ``sending`` and ``pending`` are its memory."""
         self.pages = tables.pages
+        self._of_settings = tables.of_settings
         arrays = {}
         addresses = {}
         for name, (kind, rows) in tables.arrays.items():
@@ -279,6 +281,9 @@ class NativeCore:
         _check(esc, 0, len(self.escs))
         row = held_settings(settings)
         self.library.kcg_apply(self.core, esc, c.byref(row))
+        for index, (made, signal) in self._of_settings.items():
+            if signal.esc == esc:
+                self.signals[index] = rescaled(made, signal, settings)
         self.escs[esc].apply(settings)
         timeouts = [each.settings.timeout_ns for each in self.escs]
         self.shortest_timeout_ns = min(timeouts)

@@ -1,20 +1,21 @@
 """Factor and offset of a signal as numbers of the core in C.
 
-It is proven for each signal that no product leaves 64 bits.
+It is proven for each signal that no product leaves 64 bits, and that the core in C sends the same
+raw value as the core in Python for each number of steps.
 """
 
 import math
 import struct
-import sys
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
-from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY
+from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY, EscSettings
 from kontronik_can_gw.esc.values import Divisor, Kind, Value
 from kontronik_can_gw.native.header import KCG
-from kontronik_can_gw.native.rows import MAX_GEAR, MAX_POLES, NotInCore
+from kontronik_can_gw.native.rows import MAX_CELLS, MAX_GEAR, MAX_POLES, NotInCore
+from kontronik_can_gw.native.simplest import Steps, round_alike, simplest
 from kontronik_can_gw.signals.plan import SignalPlan
 from kontronik_can_gw.times import END_OF_TIME
 
@@ -29,57 +30,103 @@ _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
     Divisor.POLE_PAIRS: (MAX_POLES, 1),
     Divisor.OUTPUT: (MAX_POLES * MAX_GEAR, MAX_GEAR),
-    Divisor.CELLS: (255, 1),
+    Divisor.CELLS: (MAX_CELLS, 1),
 }
+_OF_SETTINGS = (Divisor.POLE_PAIRS, Divisor.OUTPUT)
 _LIMIT = 1 << 63
-_MAX_DIGITS = 15
-"""Digits that a factor of a DBC has at most."""
-_SMALLEST = Fraction(sys.float_info.min)
-_LARGEST = Fraction(sys.float_info.max)
-_MAX_POWER = 330
-"""A factor that fits is searched within this power of ten."""
+_HALF = Fraction(1, 2)
+_DIGITS = range(15, 6, -1)
+"""Numbers of digits of the factors that a message suggests."""
+_ALIKE = Fraction(1, 10**6)
+"""Largest relative difference between such a factor and the factor in use."""
 
 
-def set_scale(row: Any, signal: SignalPlan, value: Value) -> None:
+class Scale(NamedTuple):
+    """Numbers of a row of kcg_signal."""
+
+    mul: int
+    add: int
+    """For a float, the bits of the offset."""
+    div: int
+    most: int
+
+
+def set_scale(
+    row: Any,
+    signal: SignalPlan,
+    value: Value,
+    esc: EscSettings,
+) -> bool:
     """Enter factor, offset and limits into a row.
 
-    Raises NotInCore if a product can leave 64 bits. The message names a factor that fits.
+    Exact numbers are valid for any settings. If a product could then leave 64 bits, the row gets a
+    simpler fraction with the same results. Such a row contains the pole pairs and the gear of
+    ``esc``. Returns True if it does, so that it has to be made again if they change. Raises
+    NotInCore if no such fraction exists.
     """
-    if signal.is_float:
-        set_one = _set_float_scale
-        row.flags |= KCG.REAL
-    else:
-        set_one = _set_integer_scale
-        if value.rolls:
-            row.flags |= KCG.ROLLS
-        if signal.saturates:
-            row.flags |= KCG.SATURATES
-        has_own_code = signal.error != signal.not_available
-        if has_own_code and signal.low <= signal.not_available <= signal.high:
-            row.flags |= KCG.CODE_AMID
-        row.low = max(signal.low, -_LIMIT)
-        row.high = min(signal.high, _LIMIT - 1)
+    is_plain = _set_limits(row, signal, value)
+    if is_plain or signal.numbers is not None:
+        return False
+    scale = _scale_of(row, signal, value)
+    found = scale.exact()
+    is_of_settings = found is None and value.divisor in _OF_SETTINGS
+    if found is None:
+        found = scale.simple(esc)
+    if found is None:
+        remedy = _fitting_factor(row, signal, value, esc) or scale.remedy
+        raise NotInCore(f"factor {_decimal(signal.factor)} exceeds 64 bits. {remedy}")
+    if is_of_settings:
+        row.divisor = KCG.BY_ONE
+    row.mul, row.add, row.div, row.most = found
+    return is_of_settings
+
+
+def rescaled(row: Any, signal: SignalPlan, esc: EscSettings) -> Any:
+    """Return a row that contains other settings than the row that ``set_scale`` made.
+
+    If no numbers fit these settings, the signal is always sent as not available.
+    """
+    assert signal.source is not None
+    found = type(row).from_buffer_copy(row)
     try:
-        set_one(row, signal, value)
-    except NotInCore as error:
-        hint = _fitting_factor(row, signal, value, set_one)
-        raise NotInCore(f"{error}.{hint}") from None
+        set_scale(found, signal, signal.source, esc)
+    except NotInCore:
+        found.flags = KCG.PLAIN
+        found.low = 1
+        found.high = 0
+        found.error = found.not_available
+    return found
 
 
-def _reduced(mul: int, add: int, div: int) -> tuple[int, int, int]:
-    """Return smaller numbers for the same quotient floor((x * mul + add) / div)."""
-    by = math.gcd(mul, add, div)
-    return (
-        mul // by,
-        add // by,
-        div // by,
-    )
+def _set_limits(row: Any, signal: SignalPlan, value: Value) -> bool:
+    """Enter flags and limits. Return True if the raw value is the number of steps."""
+    if signal.is_float:
+        row.flags |= KCG.REAL
+        row.low, row.high = map(_bits_of, signal.limits)
+        if signal.intercept == 0:
+            row.flags |= KCG.PLAIN
+        row.add = _bits_of(float(signal.intercept))
+        return False
+    if value.rolls:
+        row.flags |= KCG.ROLLS
+    if signal.saturates:
+        row.flags |= KCG.SATURATES
+    has_own_code = signal.error != signal.not_available
+    if has_own_code and signal.low <= signal.not_available <= signal.high:
+        row.flags |= KCG.CODE_AMID
+    row.low = max(signal.low, -_LIMIT)
+    row.high = min(signal.high, _LIMIT - 1)
+    is_identity = signal.slope == 1 and signal.intercept == 0
+    is_plain = value.divisor is Divisor.ONE and is_identity
+    if is_plain:
+        row.flags |= KCG.PLAIN
+    return is_plain
 
 
 def _range(row: Any, value: Value) -> tuple[int, int]:
     """Return the smallest and the greatest number of steps, before they are divided."""
     if row.kind in (KCG.OF_LIVE, KCG.OF_INFO, KCG.OF_LAST):
-        return _TYPE_RANGES[row.wire]
+        return (0, row.mask) if row.mask else _TYPE_RANGES[row.wire]
     if row.kind == KCG.OF_DIRECTED:
         largest = max(map(abs, _TYPE_RANGES[row.wire]))
         return -largest, largest
@@ -93,69 +140,167 @@ def _range(row: Any, value: Value) -> tuple[int, int]:
     return low, MAX_COUNT  # in ms or frames
 
 
-def _set_integer_scale(row: Any, signal: SignalPlan, value: Value) -> None:
-    """Factor and offset of an integer signal. NotInCore if a product leaves 64 bits."""
-    is_identity = signal.slope == 1 and signal.intercept == 0
-    if value.divisor is Divisor.ONE and is_identity:
-        row.flags |= KCG.PLAIN
-        return
-    if signal.numbers is not None:
-        return
-    common = signal.slope.denominator * signal.intercept.denominator
-    mul = 2 * int(signal.slope * common)
-    add = 2 * int(signal.intercept * common) + common  # plus one half: halves are rounded up
-    mul, add, div = _reduced(mul, add, 2 * common)
-    most = _most(row, signal, value, (mul, add, div))
-    by, over = _LARGEST_DIVISOR[value.divisor]
-    greatest = most * abs(mul) * over + abs(add) * by
-    if greatest >= _LIMIT or div * by >= _LIMIT:
-        raise NotInCore(f"factor {_decimal(signal.factor)} exceeds 64 bits")
-    row.mul = mul
-    row.add = add
-    row.div = div
-    row.most = most
+def _scale_of(row: Any, signal: SignalPlan, value: Value) -> "_IntegerScale | _FloatScale":
+    """Return what finds the numbers of a row whose limits are set."""
+    if signal.is_float:
+        return _FloatScale(row, signal, value)
+    return _IntegerScale(row, signal, value)
 
 
-def _most(
-    row: Any,
-    signal: SignalPlan,
-    value: Value,
-    scale: tuple[int, int, int],
-) -> int:
-    """Return the largest absolute number of steps that the core has to multiply.
+class _IntegerScale:
+    """Finds the numbers of an integer signal.
 
-    Beyond it, in either direction, the signal cannot hold the value, whatever the divisor is, and
-    is Error. A counter that rolls over is never too large.
+    The raw value is ``floor((x * mul * over + add * by) / (div * by))``, and the fraction by / over
+    is the divisor.
     """
-    greatest = max(map(abs, _range(row, value)))
-    mul, add, div = scale
-    if value.rolls or not mul:
-        return greatest
-    by, _ = _LARGEST_DIVISOR[value.divisor]
-    above = (signal.high + 1) * div - add
-    below = add - signal.low * div
-    first_too_large = by * max(0, above, below) // abs(mul) + 1
-    return min(greatest, first_too_large)
+
+    remedy = "A smaller maximum or fewer bits may fit"
+
+    def __init__(self, row: Any, signal: SignalPlan, value: Value) -> None:
+        self._signal = signal
+        self._value = value
+        self._low, self._high = _range(row, value)
+        self._intercept = signal.intercept + _HALF  # halves are rounded up
+
+    def exact(self) -> Scale | None:
+        """Return the exact numbers, or None if a product can leave 64 bits with any settings."""
+        slope = self._signal.slope
+        div = math.lcm(slope.denominator, self._intercept.denominator)
+        mul = int(slope * div)
+        add = int(self._intercept * div)
+        by, _ = divisor = _LARGEST_DIVISOR[self._value.divisor]
+        return self._within_limits(mul, add, div, self._most(slope / by), divisor)
+
+    def simple(self, esc: EscSettings) -> Scale | None:
+        """Return the simplest numbers with the same results for these settings, or None."""
+        by = 1
+        slope = self._signal.slope
+        if self._value.divisor in _OF_SETTINGS:
+            slope /= _ratio(self._value.divisor, esc)
+        elif self._value.divisor is Divisor.CELLS:
+            by = MAX_CELLS
+        most = self._most(slope / by)
+        lines = [self._steps(slope / count, most) for count in range(by, 0, -1)]
+
+        def intercepts(slope: Fraction) -> tuple[Fraction, Fraction]:
+            lowest = Fraction(-_LIMIT)
+            end = Fraction(_LIMIT)
+            for count, line in zip(range(by, 0, -1), lines, strict=True):
+                own_lowest, own_end = line.intercepts(slope / count)
+                lowest = max(lowest, own_lowest)
+                end = min(end, own_end)
+                if lowest >= end:
+                    break
+            return lowest, end
+
+        def is_good(other: Fraction) -> bool:
+            lowest, end = intercepts(other)
+            return lowest < end and bool(other)  # core.c needs the sign of the slope
+
+        found = simplest(slope, is_good)
+        lowest, end = intercepts(found)
+        div = found.denominator
+        while (add := math.ceil(lowest * div)) >= end * div:
+            div += found.denominator
+        return self._within_limits(int(found * div), add, div, most, (by, 1))
+
+    def _most(self, slope: Fraction) -> int:
+        """Return the largest absolute number of steps that the core has to multiply.
+
+        Beyond it, in either direction, the signal cannot hold the value, whatever the divisor is,
+        and is Error. A counter that rolls over is never too large.
+        """
+        greatest = max(abs(self._low), abs(self._high))
+        if self._value.rolls or not slope:
+            return greatest
+        above = self._signal.high + 1 - self._intercept
+        below = self._intercept - self._signal.low
+        widest: Fraction = max(Fraction(0), above, below)
+        return min(greatest, int(widest / abs(slope)))
+
+    def _steps(self, slope: Fraction, most: int) -> Steps:
+        """Return the raw values of the steps for which they must be equal.
+
+        They end one step after the first value that the signal cannot hold. Beyond it, the results
+        are equal because they are ordered as the steps are.
+        """
+        low = max(self._low, -most)
+        high = min(self._high, most)
+        if self._value.rolls:
+            return Steps(slope, self._intercept, low, high)
+        ends = [
+            (self._signal.low - self._intercept) / slope,
+            (self._signal.high + 1 - self._intercept) / slope,
+        ]
+        first = min(high, max(low, math.floor(min(ends)) - 1))
+        last = max(low, min(high, math.ceil(max(ends)) + 1))
+        return Steps(slope, self._intercept, first, last)
+
+    def _within_limits(
+        self,
+        mul: int,
+        add: int,
+        div: int,
+        most: int,
+        divisor: tuple[int, int],
+    ) -> Scale | None:
+        """Return the numbers in lowest terms. None if a product leaves 64 bits."""
+        common = math.gcd(mul, add, div)
+        scale = Scale(mul // common, add // common, div // common, most)
+        by, over = divisor
+        greatest = max(1, most) * abs(scale.mul) * over + abs(scale.add) * by
+        if max(greatest, scale.div * by) >= _LIMIT:
+            return None
+        return scale
 
 
-def _set_float_scale(row: Any, signal: SignalPlan, value: Value) -> None:
-    """Factor, offset and limits of a float signal. NotInCore if a product leaves 63 bits."""
-    low, high = signal.limits
-    row.low = _bits_of(low)
-    row.high = _bits_of(high)
-    by, over = _LARGEST_DIVISOR[value.divisor]
-    mul = signal.slope.numerator
-    div = signal.slope.denominator
-    most = max(map(abs, _range(row, value)))
-    greatest = most * abs(mul) * over
-    if signal.numbers is None and max(greatest, div * by) >= _LIMIT // 2:
-        raise NotInCore(f"factor {_decimal(signal.factor)} exceeds 63 bits")
-    if signal.numbers is None:
-        row.mul = mul
-        row.div = div
-    row.add = _bits_of(float(signal.intercept))
-    if signal.intercept == 0:
-        row.flags |= KCG.PLAIN
+class _FloatScale:
+    """Finds the numbers of a float signal: ``x * mul * over / (div * by)``, then the offset."""
+
+    remedy = "An integer may fit"
+
+    def __init__(self, row: Any, signal: SignalPlan, value: Value) -> None:
+        self._signal = signal
+        self._value = value
+        self._add = row.add
+        self._most = max(map(abs, _range(row, value)))
+
+    def exact(self) -> Scale | None:
+        """Return the exact numbers, or None if a product can leave 63 bits with any settings."""
+        return self._within_limits(self._signal.slope, _LARGEST_DIVISOR[self._value.divisor])
+
+    def simple(self, esc: EscSettings) -> Scale | None:
+        """Return the simplest numbers with the same results for these settings, or None."""
+        if self._value.divisor is Divisor.CELLS:
+            return None
+        slope = self._signal.slope / _ratio(self._value.divisor, esc)
+        has_limits = any(map(math.isfinite, self._signal.limits))
+        is_single = self._signal.length == 32 and not self._signal.intercept and not has_limits
+        # A number is rounded to 53 digits first. That error is half a unit of its last digit.
+        digits = 24 if is_single else 53
+        slack = Fraction(1, 1 << 30) if is_single else Fraction(0)
+        largest = Fraction(1 << (126 if is_single else 1022))
+        if abs(slope) < 1 / largest or abs(slope) * self._most > largest:
+            return None  # not a normal number
+
+        def is_good(other: Fraction) -> bool:
+            return round_alike(slope, other, self._most, digits, slack)
+
+        return self._within_limits(simplest(slope, is_good), (1, 1))
+
+    def _within_limits(self, slope: Fraction, divisor: tuple[int, int]) -> Scale | None:
+        by, over = divisor
+        greatest = self._most * abs(slope.numerator) * over
+        if max(greatest, slope.denominator * by) >= _LIMIT // 2:
+            return None
+        return Scale(slope.numerator, self._add, slope.denominator, 0)
+
+
+def _ratio(divisor: Divisor, esc: EscSettings) -> Fraction:
+    """Return the divisor of a value's steps with these settings."""
+    if divisor is Divisor.ONE:
+        return Fraction(1)
+    return esc.pole_pairs * (esc.gear if divisor is Divisor.OUTPUT else Fraction(1))
 
 
 def _bits_of(number: float) -> int:
@@ -168,19 +313,10 @@ def _fitting_factor(
     row: Any,
     signal: SignalPlan,
     value: Value,
-    set_one: Callable[..., None],
+    esc: EscSettings,
 ) -> str:
-    """Return a hint with a factor that the core can express, or "".
-
-    It has fewer digits. If no such factor fits, it is a coarser or a finer power of ten.
-    """
-    rounded = [f"{float(signal.factor):.{digits}g}" for digits in range(_MAX_DIGITS, 0, -1)]
-    first = Fraction(rounded[-1])
-    coarser = [first * 10**power for power in range(1, _MAX_POWER)]
-    finer = [first / 10**power for power in range(1, _MAX_POWER)]
-    for factor in (*map(Fraction, rounded), *coarser, *finer):
-        if not _SMALLEST <= abs(factor) <= _LARGEST:
-            continue  # no factor of a DBC, which is a float
+    """Return a remedy with an almost equal factor that the core can express, or ""."""
+    for factor in _rounded(signal.factor):
         ratio = signal.factor / factor
         other = replace(
             signal,
@@ -188,14 +324,20 @@ def _fitting_factor(
             slope=signal.slope * ratio,
             intercept=signal.intercept * ratio,
         )
-        try:
-            set_one(type(row).from_buffer_copy(row), other, value)
-        except (NotInCore, OverflowError):
-            continue
-        return f" Factor {_decimal(factor)} fits"
+        scale = _scale_of(row, other, value)
+        if scale.exact() or scale.simple(esc):
+            return f"Factor {_decimal(factor)} fits"
     return ""
+
+
+def _rounded(factor: Fraction) -> Iterator[Fraction]:
+    """Yield the factor with fewer and fewer digits, as long as it is almost the same."""
+    for digits in _DIGITS:
+        rounded = Fraction(f"{float(factor):.{digits}g}")
+        if 0 < abs(rounded - factor) <= _ALIKE * abs(factor):
+            yield rounded
 
 
 def _decimal(number: Fraction) -> str:
     """Return a factor as it is written in a DBC."""
-    return f"{float(number):.{_MAX_DIGITS}g}"
+    return f"{float(number):.15g}"

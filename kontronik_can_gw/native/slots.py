@@ -93,6 +93,8 @@ def slot_rows(plan: SlotPlan, protocol: str) -> Tables:
     layout = Layout("", "", (plan.message,))
     settings = EscSettings(protocol=protocol)
     tables = Tables(layout, (settings,))
+    if tables.of_settings:
+        raise NotInCore("its rows would contain the settings of an ESC")
     rows = max(len(tables.signals), len(tables.pieces))
     if rows > MAX_SIGNALS or tables.pairs:
         raise NotInCore(f"too many values in one frame ({len(tables.signals)})")

@@ -78,6 +78,9 @@ class Tables:
         """A row of kcg_slot_row for each slot."""
         self.listeners_of: list[list[int]] = [[] for _ in escs]
         """For each ESC, the messages that follow its events."""
+        self.of_settings: dict[int, tuple[Any, SignalPlan]] = {}
+        """Rows of ``signals`` that contain the pole pairs and the gear of their ESC, by index."""
+        self._escs = escs
         self._wire = [places_of(protocol_named(esc.protocol)) for esc in escs]
         starts = phases([plan.cycle_ns for plan in layout.messages])
         if len(escs) >= ALL_ESCS or len(layout.messages) > 0xFFFF:
@@ -224,38 +227,73 @@ class Tables:
                 name = f"{plan.name}.{signal.name}"
                 raise NotInCore(f"{name}: an alive counter of {signal.length} bits is too long")
         else:
-            assert signal.source is not None
-            places = self._wire[signal.esc or 0]
             try:
-                bind(row, signal.source, places, signal.esc)
-                self._scale(row, signal, signal.source)
+                self._add_source(row, signal)
             except NotInCore as error:
                 raise NotInCore(f"{plan.name}.{signal.name}: {error}") from None
         self.signals.append(row)
 
-    def _scale(self, row: Any, signal: SignalPlan, value: Value) -> None:
-        flags = row.flags
+    def _add_source(self, row: Any, signal: SignalPlan) -> None:
+        value = signal.source
+        assert value is not None
+        esc = signal.esc or 0
+        bind(row, value, self._wire[esc], signal.esc)
         if signal.numbers is not None:
             row.first_pair = len(self.pairs)
             row.pairs = len(signal.numbers)
             for number, raw in signal.numbers.items():
                 self.pairs.append(Pair(int(number), raw & _M64))
-            flags |= KCG.TABLE
-        row.flags = flags
-        set_scale(row, signal, value)
+            row.flags |= KCG.TABLE
+        is_of_settings = set_scale(row, signal, value, self._escs[esc])
+        if is_of_settings:
+            self.of_settings[len(self.signals)] = row, signal
 
 
 Words = list[tuple[int, int]]
 Places = tuple[Words, Words]
-"""Offset after the header and wire type of each word, for live data and info data."""
-_KINDS = {
-    Kind.INTEGRAL: KCG.OF_ENERGY,
-    Kind.RUN_TIME: KCG.OF_RUN_TIME,
-    Kind.AGE: KCG.OF_AGE,
-    Kind.RATE: KCG.OF_RATE,
+"""Offset after the header and wire type of each word, in live data and in info data."""
+_COUNTERS = {
+    (Kind.STATE, "link_state"): "link_state",
+    (Kind.STATE, "layout"): "layout",
+    (Kind.COUNT, "losses"): "losses",
+    (Kind.COUNT, "crc_errors"): "crc_errors",
+    (Kind.COUNT, "dropped_bytes"): "dropped_bytes",
+    (Kind.COUNT, "live_frames"): "live_frames",
+    (Kind.COUNT, "info_frames"): "info_frames",
+    (Kind.COUNT, "received_bytes"): "bytes",
+    (Kind.COUNT, "suspect_frames"): "suspect_frames",
+    (Kind.OBJECT, "live_counter"): "live_frames",
 }
-_NAME_OF = {"received_bytes": "bytes", "live_counter": "live_frames"}
-"""Values that have another name in COUNTS."""
+"""Maps kind and name of a value to a name of COUNTS."""
+_OF_GATEWAY = (
+    "gateway_state",
+    "can_state",
+    "esc_count",
+    "escs_ok",
+    "sent_frames",
+    "replaced_frames",
+    "send_failures",
+    "received_frames",
+    "bus_off_count",
+    "dropped_frames",
+    "id_conflicts",
+    "can_restarts",
+)
+SOURCES: dict[tuple[Kind, str], tuple[int, int]] = {
+    (Kind.PRODUCT, "battery_power"): (KCG.OF_POWER, 0),
+    (Kind.INTEGRAL, "energy_used"): (KCG.OF_ENERGY, 0),
+    (Kind.RUN_TIME, "motor_run_time"): (KCG.OF_RUN_TIME, 0),
+    (Kind.AGE, "data_age"): (KCG.OF_AGE, 0),
+    (Kind.RATE, "frame_rate"): (KCG.OF_RATE, 0),
+    (Kind.GATEWAY, "uptime"): (KCG.OF_UPTIME, 0),
+    (Kind.OBJECT, "link_status"): (KCG.OF_STATUS, GatewayState.REPLAY),
+    **{key: (KCG.OF_COUNT, COUNTS.index(name)) for key, name in _COUNTERS.items()},
+    **{(Kind.GATEWAY, name): (KCG.OF_GATEWAY, GATEWAY.index(name)) for name in _OF_GATEWAY},
+}
+"""``kind`` and ``place`` of a row of kcg_signal for each value that is not a field of the wire.
+
+The core in C computes these values itself. It has no other ones.
+"""
 
 
 def bind(
@@ -266,42 +304,34 @@ def bind(
 ) -> None:
     """Enter the source of a value into a row of Signal. Raises NotInCore if the core has none."""
     row.divisor = _DIVISORS[value.divisor]
-    name = _NAME_OF.get(value.name, value.name)
     if value.kind in (Kind.WIRE, Kind.BITS):
         if not value.supplied or esc is None:
             raise NotInCore("not supplied by this ESC's protocol")
-        is_info = value.group is Group.INFO or value.last
-        row.kind = KCG.OF_LIVE
-        if value.last:
-            row.kind = KCG.OF_LAST
-        elif is_info:
-            row.kind = KCG.OF_INFO
-        row.place, row.wire = places[is_info][value.words[0]]
-        row.not_on = sum(1 << device for device in value.not_on)
-        if value.mask != -1:
-            row.shift = value.shift
-            row.mask = value.mask
-        if value.negative_in is not None:
-            bind_direction(row, value.negative_in, places[False])
-        elif row.kind == KCG.OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
-            row.flags = KCG.DIRECT
-    elif value.kind is Kind.PRODUCT:
-        row.kind = KCG.OF_POWER
-    elif value.name == "uptime":
-        row.kind = KCG.OF_UPTIME
-    elif value.kind is Kind.GATEWAY and value.name in GATEWAY and value.name != "started_ns":
-        row.kind = KCG.OF_GATEWAY
-        row.place = GATEWAY.index(value.name)
-    elif value.kind in _KINDS:
-        row.kind = _KINDS[value.kind]
-    elif value.kind is Kind.OBJECT and value.name == "link_status":
-        row.kind = KCG.OF_STATUS
-        row.place = GatewayState.REPLAY
-    elif name in COUNTS and (value.kind is not Kind.OBJECT or value.name in _NAME_OF):
-        row.kind = KCG.OF_COUNT
-        row.place = COUNTS.index(name)
-    else:
+        _bind_field(row, value, places)
+        return
+    source = SOURCES.get((value.kind, value.name))
+    if source is None:
         raise NotInCore(f"{value.name} is computed in Python only")
+    row.kind, row.place = source
+
+
+def _bind_field(row: Any, value: Value, places: Places) -> None:
+    """Enter a field of the wire, or some bits of a field."""
+    is_info = value.group is Group.INFO or value.last
+    row.kind = KCG.OF_LIVE
+    if value.last:
+        row.kind = KCG.OF_LAST
+    elif is_info:
+        row.kind = KCG.OF_INFO
+    row.place, row.wire = places[is_info][value.words[0]]
+    row.not_on = sum(1 << device for device in value.not_on)
+    if value.mask != -1:
+        row.shift = value.shift
+        row.mask = value.mask
+    if value.negative_in is not None:
+        bind_direction(row, value.negative_in, places[False])
+    elif row.kind == KCG.OF_LIVE and value.divisor is Divisor.ONE and not row.not_on:
+        row.flags = KCG.DIRECT
 
 
 def places_of(protocol: EscProtocol) -> Places:

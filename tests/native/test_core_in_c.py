@@ -4,14 +4,16 @@ import ctypes as c
 import random
 import re
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import equality
 import pytest
+import random_scales
 from built import STRICT, built, run_sanitized
 from dbc_bench import compiled
-from packer_oracle import Msg, Sig, dbc_text
+from packer_oracle import Msg, Sig, dbc_text, random_live
 
 from kontronik_can_gw.canopen.bound_values import compile_pdo
 from kontronik_can_gw.canopen.dictionary import Variable
@@ -23,6 +25,8 @@ from kontronik_can_gw.core.slots import SlotPlan, SlotSettings
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.values import VALUES, Kind
+from kontronik_can_gw.native import tables
 from kontronik_can_gw.native.binding import WrongObject, load
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.header import KCG
@@ -122,36 +126,171 @@ def test_a_factor_of_many_digits_gives_the_same_frames_in_c(native_library: Any,
         assert len(python) == 1
 
 
-@pytest.mark.parametrize("kind", ["", "SIG_VALTYPE_ 256 S : 1;"])
-@pytest.mark.parametrize("offset", ["0", "1e9"])
-@pytest.mark.parametrize("factor", ["1e-300", "-5e-324", "1e30", "0.00000012345678"])
-def test_a_factor_that_does_not_fit_is_refused_with_one_that_fits(
-    factor: str,
-    offset: str,
-    kind: str,
+@pytest.mark.parametrize("digits", [10, 17])
+def test_factors_of_many_digits_run_in_c_and_can_be_exported(
+    native_library: Any, digits: int
 ) -> None:
-    signal = f'SG_ S : 0|32@1- ({{}},{offset}) [0|0] "" X'
-    text = f'VERSION ""\nBU_: G X\nBO_ 256 M: 8 G\n {signal}\n{kind}\n'
+    """The normal tier has 40 of the 160 DBCs of the extended one."""
+    reasons = [random_scales.run(native_library, seed, digits) for seed in range(40)]
+    assert reasons.count("") >= (39 if digits == 10 else 36), reasons
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize(("digits", "least"), [(10, 155), (17, 140)])
+def test_160_dbcs_with_factors_of_many_digits_run_in_c(
+    native_library: Any, digits: int, least: int
+) -> None:
+    reasons = [random_scales.run(native_library, seed, digits) for seed in range(160)]
+    print(reasons.count(""), [reason for reason in reasons if reason])
+    assert reasons.count("") >= least, reasons
+
+
+RAD_PER_S = """VERSION ""
+BU_: G X
+BO_ 256 M: 8 G
+ SG_ Speed : 0|16@1+ (1,0) [0|0] "rad/s" X
+ SG_ Output : 16|16@1+ (0.0001,0) [0|0] "1/min" X
+ SG_ Power : 32|16@1- (0.01,0) [0|0] "hp" X
+"""
+BINDINGS_OF_RAD_PER_S = {
+    "Speed": "motor_speed",
+    "Output": "output_speed",
+    "Power": "battery_power",
+}
+
+
+def test_settings_changed_at_run_time_apply_to_speeds_in_rad_per_s(native_library: Any) -> None:
+    """Rows whose exact numbers leave 64 bits contain the settings, so they are made again."""
+    layout = compiled(RAD_PER_S, bind=BINDINGS_OF_RAD_PER_S)
+    escs = [EscSettings("esc1", 7, Fraction(5, 2))]
+    assert Tables(layout, escs).of_settings
+    cores = (
+        PythonCore(escs, layout, 0, False),
+        NativeCore(native_library, escs, layout, 0, False),
+    )
+    now = 0
+    for poles, gear in ((7, Fraction(5, 2)), (14, Fraction("9.81818")), (255, Fraction(1, 9))):
+        for speed in (1, 4_177, 70_000, 654_321, 2**32 - 1):
+            now += 10 * MS
+            data = encode(LiveData(electrical_speed=speed), WireLayout.V4)
+            frames = []
+            for core in cores:
+                core.apply(0, EscSettings("esc1", poles, gear))
+                core.receive(0, data, now, now)
+                core.advance(now)
+                frames.append(core.take(now))
+            assert frames[0] == frames[1], (poles, gear, speed)
+
+
+TOO_FINE = ' SG_ S : 0|32@1+ ({},0) [0|0] "{}" X\n'
+HEAD = 'VERSION ""\nBU_: G X\nBO_ 256 M: 8 G\n'
+
+
+@pytest.mark.parametrize(
+    ("source", "factor", "remedy"),
+    [
+        ("motor_run_time", "3.14159265358979312", r"Factor (3\.1415926\d+) fits"),
+        ("motor_run_time", "0.00012345678912345678", r"Factor (0\.00012345678\d+) fits"),
+    ],
+)
+def test_a_suggested_factor_fits_and_is_almost_equal(
+    source: str,
+    factor: str,
+    remedy: str,
+) -> None:
     escs = [EscSettings("esc1")]
+    text = HEAD + TOO_FINE
     with pytest.raises(NotInCore) as found:
-        Tables(compiled(text.format(factor), bind={"S": "output_speed"}), escs)
-    advice = re.search(r"exceeds 6[34] bits\. Factor (\S+) fits", str(found.value))
+        Tables(compiled(text.format(factor, "s"), bind={"S": source}), escs)
+    advice = re.search(r"M\.S: factor \S+ exceeds 64 bits\. " + remedy, str(found.value))
     assert advice is not None, str(found.value)
-    Tables(compiled(text.format(advice[1]), bind={"S": "output_speed"}), escs)
+    assert abs(float(advice[1]) / float(factor) - 1) <= 1e-6
+    Tables(compiled(text.format(advice[1], "s"), bind={"S": source}), escs)
 
 
-def test_a_factor_that_leaves_64_bits_is_named_with_one_that_fits() -> None:
-    """``output_speed`` is divided by pole pairs and gear, which may be large."""
-    text = 'VERSION ""\nBU_: G X\nBO_ 256 M: 8 G\n SG_ S : 0|32@1+ ({},0) [0|0] "" X\n'
-    escs = [EscSettings("esc1")]
-    refused = compiled(text.format("0.0039215686"), bind={"S": "output_speed"})
+def test_no_factor_is_suggested_if_none_is_almost_equal() -> None:
+    """The exact value in days needs more than 64 bits, and a rounded factor does not help."""
+    text = HEAD + ' SG_ S : 0|64@1+ (1,0) [0|0] "rad/s" X\n'
     with pytest.raises(NotInCore) as found:
-        Tables(refused, escs)
-    message = str(found.value)
-    pattern = r"M\.S: factor 0.0039215686 exceeds 64 bits\. Factor (\S+) fits"
-    advice = re.fullmatch(pattern, message)
-    assert advice is not None, message
-    Tables(compiled(text.format(advice[1]), bind={"S": "output_speed"}), escs)
+        Tables(
+            compiled(text.replace("(1,", "(1e-9,"), bind={"S": "output_speed"}),
+            [EscSettings("esc1")],
+        )
+    reason = "M.S: factor 1e-09 exceeds 64 bits. A smaller maximum or fewer bits may fit"
+    assert str(found.value) == reason
+
+
+FLOAT = ' SG_ S : 0|{}@1- ({},0) [0|0] "{}" X\nSIG_VALTYPE_ 256 S : {};\n'
+SINGLE = 32, 1
+DOUBLE = 64, 2
+
+
+@pytest.mark.parametrize(
+    ("source", "unit", "factor", "form"),
+    [
+        ("motor_speed", "rad/s", "1", SINGLE),
+        ("battery_power", "hp", "1", SINGLE),
+        ("battery_current", "A", "0.12345678901234567", SINGLE),
+        ("battery_current", "A", "0.12345678901234567", DOUBLE),
+    ],
+)
+def test_a_float_with_a_factor_of_many_digits_gives_the_same_frames_in_c(
+    native_library: Any,
+    source: str,
+    unit: str,
+    factor: str,
+    form: tuple[int, int],
+) -> None:
+    length, code = form
+    layout = compiled(HEAD + FLOAT.format(length, factor, unit, code), bind={"S": source})
+    escs = [EscSettings("esc1", 7)]
+    python = PythonCore(escs, layout, 0, False)
+    native = NativeCore(native_library, escs, layout, 0, False)
+    chance = random.Random(1)
+    for number in range(500):
+        now = number * 10 * MS
+        data = encode(random_live(chance), WireLayout.V4)
+        frames = []
+        for core in (python, native):
+            core.receive(0, data, now, now)
+            core.advance(now)
+            frames.append(core.take(now))
+        assert frames[0] == frames[1], number
+
+
+@pytest.mark.parametrize(
+    ("factor", "form"),
+    [
+        ("1", DOUBLE),
+        ("1e-300", SINGLE),
+    ],
+)
+def test_a_float_that_needs_more_than_64_bits_is_refused(
+    factor: str, form: tuple[int, int]
+) -> None:
+    length, code = form
+    layout = compiled(HEAD + FLOAT.format(length, factor, "rad/s", code), bind={"S": "motor_speed"})
+    with pytest.raises(NotInCore, match=r"exceeds 64 bits\. An integer may fit$"):
+        Tables(layout, [EscSettings("esc1", 7)])
+
+
+def test_a_value_that_the_c_core_does_not_compute_is_refused_by_name() -> None:
+    """A product is not the battery's power just because it is a product."""
+    power = VALUES["battery_power"]
+    bec = replace(power, name="BEC power", words=VALUES["bec_voltage"].words + power.words[1:])
+    (plan,) = compiled(HEAD + TOO_FINE.format(1, "W"), bind={"S": "battery_power"}).messages
+    (signal,) = plan.signals
+    other = replace(plan, compiled=(replace(signal, source=bec),))
+    with pytest.raises(NotInCore, match=r"^M\.S: BEC power is computed in Python only$"):
+        Tables(Layout("", "", (other,)), [EscSettings("esc1")])
+
+
+def test_every_value_of_the_product_has_a_source_in_c() -> None:
+    """The table of sources has no other names."""
+    own = {Kind.WIRE, Kind.BITS}
+    names = {(value.kind, value.name) for value in VALUES.values() if value.kind not in own}
+    of_objects = {key for key in tables.SOURCES if key[0] is Kind.OBJECT}
+    assert names == {*tables.SOURCES} - of_objects
 
 
 _COUNTED = """

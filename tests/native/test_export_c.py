@@ -96,10 +96,10 @@ def test_a_signal_that_the_core_cannot_express_is_refused(
     dbc = tmp_path / "big.dbc"
     dbc.write_text(
         'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Car\nBO_ 256 M: 8 Gw\n'
-        ' SG_ LinkState : 0|32@1+ (0.00592884289493769,89.21540281025877) [0|0] "" Car\n'
+        ' SG_ MotorRunTime : 0|32@1+ (3.1415926535897931,0) [0|0] "s" Car\n'
     )
     assert main(["export", "c", "--dbc", str(dbc), str(tmp_path / "out")]) == 2
-    reason = "M.LinkState: factor 0.00592884289493769 exceeds 64 bits. Factor"
+    reason = "M.MotorRunTime: factor 3.14159265358979 exceeds 64 bits. Factor 3.14159"
     assert f"cannot be exported: {reason}" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

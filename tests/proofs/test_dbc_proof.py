@@ -193,7 +193,7 @@ def test_chosen_messages_without_a_transmitter_are_proven(tmp_path: Path) -> Non
 def test_a_layout_that_only_python_can_send_is_proven_for_python(tmp_path: Path) -> None:
     found = proof_of(configuration(tmp_path, "wide.dbc"))
     assert found["refuted"] == []
-    assert found["proven"] == ["LeftWide.LeftOutputSpeed", "RightWide.RightOutputSpeed"]
+    assert found["proven"] == ["LeftWide.LeftMotorRunTime", "RightWide.RightMotorRunTime"]
     assert "exceeds 64 bits" in found["only_python"]
 
 

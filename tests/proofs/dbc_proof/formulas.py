@@ -83,6 +83,9 @@ def compare(expected: Rule, planned: Planned, settings: Settings) -> Verdict:
     """
     if planned.scale is not None and planned.scale.div <= 0:
         return Verdict(reason="the plan divides by a number that is not positive")
+    if planned.is_of_settings:
+        found = _World(expected, planned, settings).solve()
+        return Verdict(reason=found) if isinstance(found, str) else Verdict(found)
     same_divisor = expected.quantity is not None and expected.quantity.divisor is planned.divisor
     if same_divisor:
         found = _World(expected, planned, None).solve()
@@ -92,10 +95,14 @@ def compare(expected: Rule, planned: Planned, settings: Settings) -> Verdict:
             return Verdict()
         if planned.divisor is Divisor.ONE:
             return Verdict(found)
+    gave_up = ""
     for each in _all_settings(settings, planned, expected):
         found = _World(expected, planned, each).solve()
         if isinstance(found, CounterExample):
             return Verdict(found)
+        gave_up = gave_up or found or ""
+    if same_divisor and planned.divisor is Divisor.CELLS:
+        return Verdict(reason=gave_up)  # these were all numbers of cells
     return Verdict(
         reason="the formula for all settings has a solution, but none for the tried ones"
     )

@@ -99,6 +99,8 @@ class Planned:
     rolls: bool = False
     saturates: bool = False
     is_float: bool = False
+    is_of_settings: bool = False
+    """True if the scale contains pole pairs and gear of the ESC, and is valid only with them."""
     has_64_bits: bool = False
     """True for the core in C. Numbers of the core in Python have no limit."""
 
@@ -275,7 +277,7 @@ def of_c(
                 name,
                 None if signal.page == KCG.PAGES else _page(pages, signal.page),
                 tuple(_within_word(piece) for piece in _rows(tables.pieces, signal, "piece")),
-                None if is_alive else _c_plan(signal, tables),
+                None if is_alive else _c_plan(at, tables),
                 signal.div if is_alive else 0,
             )
         )
@@ -439,7 +441,8 @@ def _c_source(row: Any) -> tuple[Read, Presence]:
     return Read(name), _PRESENCE.get(name, Presence.ALWAYS)
 
 
-def _c_plan(row: Any, tables: Tables) -> Planned:
+def _c_plan(index: int, tables: Tables) -> Planned:
+    row = tables.signals[index]
     read, presence = _c_source(row)
     flags = row.flags
     numbers: dict[int, int] | None = None
@@ -471,6 +474,7 @@ def _c_plan(row: Any, tables: Tables) -> Planned:
         rolls=bool(flags & KCG.ROLLS),
         saturates=bool(flags & KCG.SATURATES),
         is_float=is_float,
+        is_of_settings=index in tables.of_settings,
         has_64_bits=True,
     )
 
