@@ -44,9 +44,9 @@ def main(args: argparse.Namespace) -> int:
         print(printable_json(result, indent=2))
         return error.exit_code
     examples = [
-        f"{loaded.config.file}: port of {esc.name}: {esc.port} is the example's port. "
+        f"{loaded.config.file}: esc[{number}].port: {esc.port} is only an example. "
         "Write the name of your port: ls /dev/serial/by-id"
-        for esc in loaded.config.esc
+        for number, esc in enumerate(loaded.config.esc, 1)
         if _EXAMPLE_PORT in esc.port
     ]
     warnings = [*loaded.layout.warnings, *loaded.warnings, *examples]

@@ -56,8 +56,8 @@ also while no frames are received. "problem" then has the reason, if it is
 known. Values are in the units of "units", and null if they are not available.
 
 exit codes: 0 ended by a key, a signal or the end of a recording, or --once has
-values; 1 no frame was received (--once), or the bus cannot be opened; 2 wrong
-usage, or the recording cannot be opened
+values, or a gateway of this machine is quiet; 1 no frame was received (--once),
+or the bus cannot be opened; 2 wrong usage, or the recording cannot be opened
 """
 
 

@@ -109,6 +109,8 @@ class Bus(Source):
             f"Is the bit rate right ({rate})?",
             "Does the gateway use another DBC (give -c or --dbc)?",
         )
+        if bus.config is None or config.quiet_after_s:
+            self.hints += ("Is the vehicle parked (can.quiet_after_s)?",)
 
     def pump(self, take: Take, until_s: float) -> None:
         frames = self._listener.receive(max(0.0, until_s - time.monotonic()))

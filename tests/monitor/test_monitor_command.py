@@ -22,7 +22,7 @@ from kontronik_can_gw.cli import monitor
 from kontronik_can_gw.cli import source as source_of_commands
 from kontronik_can_gw.config.keys import CanConfig, shipped
 from kontronik_can_gw.desk import member, sources
-from kontronik_can_gw.desk.monitor import model, screen, watch
+from kontronik_can_gw.desk.monitor import model, screen, status, watch
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.sources import Recording
 from kontronik_can_gw.errors import RunError
@@ -234,6 +234,44 @@ def test_stream_of_a_bus_without_frames_gives_the_reason() -> None:
     assert [one["interface"] for one in found] == ["can0"] * 3
     for one in found:
         assert set(one["escs"][0]["values"].values()) == {None}
+
+
+@pytest.mark.parametrize(
+    ("channel", "state", "age_s"), [("can0", "quiet", 0), ("can1", "quiet", 0),
+                                    ("can0", "running", 0), ("can0", "quiet", 60)],
+)  # fmt: skip
+def test_once_on_a_silent_bus_knows_a_quiet_gateway_of_this_machine(
+    channel: str,
+    state: str,
+    age_s: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Silent(sources.Source):
+        clock = 100 * SECOND_NS
+        hints = ("Is the gateway running?",)
+
+        def pump(self, take: sources.Take, until_s: float) -> None:
+            self.clock += SECOND_NS
+
+        def now(self) -> int:
+            return self.clock
+
+    file = tmp_path / "status.json"
+    seen = {"can": {"channel": channel}, "gateway": {"state": state}}
+    code = status.NOT_RUNNING if age_s else status.HEALTHY
+    found = status.Seen(file, code, state, document=seen)
+    monkeypatch.setattr(status, "look_at", lambda _file, _now: found)
+    monkeypatch.setattr(status, "published_files", lambda: [file])
+    monitor = model.Monitor(ONE)
+    monitor.advance(0)
+    if (channel, state, age_s) == ("can0", "quiet", 0):
+        shown = watch.once(Silent("can0", ONE), monitor, 0, lambda: False)
+        assert shown["gateway"]["state"] == "Quiet"
+        assert shown["frames"] == 0
+    else:
+        with pytest.raises(RunError, match=r"no frame of .* Is the gateway running\?"):
+            watch.once(Silent("can0", ONE), monitor, 0, lambda: False)
 
 
 # --- the name of an interface or of a recording

@@ -22,6 +22,7 @@ from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.sources import DemoBus, Source
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
+from kontronik_can_gw.frames import CanFrame
 
 
 def source_of(monitor: Monitor, name: str = "can0", problem: str = "") -> Source:
@@ -127,6 +128,53 @@ def test_errors_are_shown_with_their_remedies_if_there_is_room() -> None:
     assert first not in "\n".join(texts(monitor, (80, 14)))
 
 
+def test_remedies_use_all_lines_that_are_free() -> None:
+    """The first alarms have a remedy if there is no room for all of them."""
+    shown = texts(seen(4, "errors"), (80, 23))
+    first = shown.index("esc1 ERROR: battery voltage too low")
+    assert shown[first + 1].startswith("  -> Stop soon.")
+    assert "esc1 ERROR: BEC current too high" in shown
+    assert "enlarge the terminal" not in "\n".join(shown)
+
+
+def test_four_escs_have_whole_states_and_use_the_screen() -> None:
+    shown = texts(seen(4), (80, 24))
+    assert "\n".join(shown).count("spool up from still") == 3
+    charts = [text for text in shown if re.match(r"esc\d (motor speed|battery|power)", text)]
+    assert len(charts) == 12
+    assert all(re.search("[▁-█]$", text) for text in charts)
+    assert shown.count("") <= 3
+    lost = "\n".join(texts(seen(4, "lost"), (80, 24)))
+    assert lost.count("no telemetry for") == 4
+
+
+def test_no_value_of_an_esc_is_shown_after_its_telemetry_is_lost() -> None:
+    """The gateway goes on sending totals, for example the energy."""
+    monitor = seen(4, "lost")
+    assert monitor.escs[0].number("energy_used") is not None
+    head, row = texts(monitor, (200, 24))[1:3]
+    assert " Wh" in head
+    assert not re.search(r"\d", row.removeprefix("esc1"))
+
+
+def test_a_quiet_gateway_is_remembered_until_it_sends_again() -> None:
+    bus = bus_of(1)
+    monitor = Monitor(bus)
+    monitor.advance(0)
+    (message,) = [each for each in bus.database.messages if "GatewayState" in each.signal_tree]
+    zeros = {signal.name: 0 for signal in message.signals}
+    for state, is_quiet in (("Quiet", True), ("Running", False), ("Quiet", True)):
+        data = message.encode({**zeros, "GatewayState": state}, strict=False)
+        monitor.take(CanFrame(message.frame_id, data), SECOND_NS)
+        assert monitor.is_quiet is is_quiet
+    monitor.advance(60 * SECOND_NS)
+    shown = "\n".join(texts(monitor, (80, 24)))
+    assert "gateway quiet" in shown
+    assert "the gateway is quiet: it sends again when an ESC is heard." in shown
+    assert "Is the gateway running?" not in shown
+    assert monitor.document()["gateway"]["state"] == "Quiet"
+
+
 def test_a_sparkline_shows_seconds_between_the_extremes_and_gaps() -> None:
     (esc,) = Monitor(bus_of(1)).escs
     track = esc.tracks["battery_voltage"]
@@ -221,7 +269,7 @@ def test_long_names_do_not_hide_the_charge(kind: str, monkeypatch: pytest.Monkey
     names = ("left_front_m", "left_front_n")
     for esc, name in zip(monitor.escs, names, strict=True):
         monkeypatch.setattr(esc, "name", name)
-    head, *rows = texts(monitor, (80, 24))[1:4]
+    head, *rows = texts(monitor, (62, 24))[1:4]
     assert head.endswith(" mAh")
     for esc, row in zip(monitor.escs, rows, strict=True):
         assert row.endswith(f" {number(esc.number('consumed_charge'))}")

@@ -19,8 +19,9 @@ from wire_world import Wire, World, loop_in, run
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import codec
-from kontronik_can_gw.esc.kontronik.fields import LiveData
+from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
+from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.ports import esc_port as esc_input
@@ -85,7 +86,7 @@ class Bench:
         return port
 
     def lose(self, number: int, now: int) -> None:
-        self.port(number).reads = [PortLost("hung up")]
+        self.port(number).reads = [PortLost("unplugged")]
         self.escs[number].serve(now)
 
     def reopen(self, now: int) -> None:
@@ -262,7 +263,7 @@ def test_an_unplugged_port_is_logged_once_until_it_is_back(
     bench.reopen(30 * SECOND)
     esc.report(30 * SECOND)
     assert caplog.messages == [
-        "left: /dev/ttyUSB0: lost (hung up). Trying again.",
+        "left: /dev/ttyUSB0: lost (unplugged). Check plug and power of the adapter. Trying again.",
         "left: /dev/ttyUSB0 is open, after 29.0 s",
     ]
 
@@ -279,6 +280,36 @@ def test_a_mini_uart_causes_a_warning_when_it_is_opened(
     (warning,) = [each for each in caplog.messages if "mini-UART" in each]
     assert warning.startswith("left: /dev/ttyS0 is a Raspberry Pi's mini-UART")
     assert warning.endswith("Use ttyAMA0.")
+
+
+def test_information_that_names_another_device_again_and_again_is_summarised(
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "kontronik_can_gw")
+    world = World()
+    (wire,) = world.wires
+    loop = loop_in(world, monkeypatch)
+    loop.open()
+    loop.begin()
+    devices = (Device.KOSMIK, Device.JIVEPRO)
+    begin = world.now
+    for n in range(120):  # a change each 2.5 s, for 5 minutes
+        at = begin + n * 2500 * MS
+        info = InfoData(device_and_variant=device_and_variant(devices[n % 2], 120))
+        for data in (codec.encode(info, codec.WireLayout.V4), LIVE):
+            wire.put(data, [at] * len(data))
+        for later in range(1, 25):
+            wire.put(LIVE, [at + later * 100 * MS] * len(LIVE))
+    run(loop, world, begin + 300 * SECOND)
+    lines = [text for text in caplog.messages if "telemetry ok" in text]
+    assert 3 < len(lines) < 10
+    assert "This happens often. The next line appears after a minute without it." in lines[-1]
+    caplog.clear()
+    run(loop, world, world.now + 62 * SECOND)
+    loop.close()
+    (line,) = [text for text in caplog.messages if "more times" in text]
+    assert line.startswith("esc1: layout or device: happened ")
 
 
 def test_a_loss_is_reported_with_its_errors(
@@ -421,8 +452,9 @@ def test_an_unreadable_port_is_lost_in_that_turn_and_others_are_read(
     lost = loop.escs[0].facts().lost_since_ns
     assert lost is not None
     assert 0 <= lost - failed <= 2 * MS
-    reason = "hung up" if hangs_up else "Input/output error"
-    assert f"esc1: /fake/0: lost ({reason}). Trying again." in caplog.messages
+    reason = "unplugged" if hangs_up else "Input/output error"
+    remedy = "Check plug and power of the adapter. Trying again."
+    assert f"esc1: /fake/0: lost ({reason}). {remedy}" in caplog.messages
     assert loop.gateway.escs[0].link is LinkState.PORT_ERROR
     run(loop, world, begin + 4 * SECOND)
     loop.close()

@@ -129,7 +129,7 @@ UNKNOWN = CanState.UNKNOWN
 OPEN = CanFacts("socketcan", "can0", None, True)
 SLCAN = CanFacts("slcan", "x", None, True)
 CLOSED = CanFacts("socketcan", "can0", None, False, "can0: gone")
-LOST = PortFacts("esc1", "/dev/a", False, "esc1: /dev/a: lost (hung up).", lost_since_ns=0)
+LOST = PortFacts("esc1", "/dev/a", False, "esc1: /dev/a: lost (unplugged).", lost_since_ns=0)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ LOST = PortFacts("esc1", "/dev/a", False, "esc1: /dev/a: lost (hung up).", lost_
         (UNKNOWN, {"can": CLOSED}, ["can0: gone"]),
         (ACTIVE, {"can": OPEN._replace(stalled=True)}, ["CAN can0: no frame can be sent"]),
         (ACTIVE, {"store": StoreFacts(0, "full")}, ["parameters cannot be stored: full"]),
-        (ACTIVE, {"ports": [LOST]}, ["esc1: port not open for 70.0 s: /dev/a: lost (hung up)."]),
+        (ACTIVE, {"ports": [LOST]}, ["esc1: port not open for 70.0 s: /dev/a: lost (unplugged)."]),
     ],
 )
 def test_each_fault_is_reported_as_a_sentence(
@@ -346,6 +346,17 @@ def test_json_is_one_document_with_the_judgement_and_the_file_content(tmp_path: 
 
 
 WHOLE = with_nodes(heard(3).document(log_lines=["14:03:01 esc1: telemetry lost"]))
+
+
+def test_a_count_and_its_label_are_on_one_line() -> None:
+    document: Any = json.loads(json.dumps(WHOLE))
+    for counts in (0, 7, 4_321, 98_765_432):
+        document["can"]["counters"] = dict.fromkeys(document["can"]["counters"], counts)
+        shown = [text.plain for text in lines_of(judge(Path("x"), document, WHOLE["monotonic_ns"]))]
+        assert max(map(len, shown)) <= 80
+        (line,) = [text for text in shown if "id conflicts" in text]
+        grouped = f"{counts:,}".replace(",", " ")
+        assert f"{grouped} id conflicts" in line
 
 
 def places(value: object, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:

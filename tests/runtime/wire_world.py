@@ -140,7 +140,7 @@ class Wire:
     def read(self, most: int = _MAX_READ) -> bytes:
         if self._has_failed:
             self._world.now += MS
-            raise PortLost("hung up" if self.hangs_up else "Input/output error")
+            raise PortLost("unplugged" if self.hangs_up else "Input/output error")
         count = min(self.waiting, most)
         data = bytes(self._bytes[self._read : self._read + count])
         self._read += count

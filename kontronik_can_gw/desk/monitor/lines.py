@@ -21,6 +21,7 @@ STATES = {
     "-": "dim",
 }
 """Styles of the states of a link, a CAN controller and a gateway. Other states are bad."""
+NO_BREAK = "\N{NO-BREAK SPACE}"
 _KINDS = {
     Severity.ERROR: ("ERROR", "bold red"),
     Severity.WARNING: ("WARNING", "yellow"),
@@ -45,14 +46,14 @@ def line(*parts: Part) -> Text:
 
 
 def wrapped(text: str, style: str, width: int) -> list[Text]:
-    """Return a text as lines of this width."""
+    """Return a text as lines of this width. NO_BREAK is shown as a space."""
     parts = textwrap.wrap(
         text,
         max(20, width),
         subsequent_indent="    ",
         break_on_hyphens=False,
     )
-    return [line((part, style)) for part in parts]
+    return [line((part.replace(NO_BREAK, " "), style)) for part in parts]
 
 
 def table(
@@ -88,17 +89,21 @@ def table(
 
 
 def alarm_lines(alarms: Iterable[tuple[str, Alarm]], width: int, room: int = 999) -> list[Text]:
-    """Return errors and warnings, each after a name. Remedies are added if there is room."""
+    """Return errors and warnings, each after a name. Remedies are added while there is room."""
+    found: list[tuple[list[Text], list[Text]]] = []
+    for name, flag in alarms:
+        kind, style = _KINDS.get(flag.severity, ("note", ""))
+        remedy: list[Text] = []
+        if flag.remedy:
+            remedy = wrapped(f"  -> {flag.remedy}", "", width)
+        found.append((wrapped(f"{name}{kind}: {flag.meaning}", style, width), remedy))
+    left = room - sum(len(said) for said, _ in found)
     lines: list[Text] = []
-    for with_remedy in (True, False):
-        lines = []
-        for name, flag in alarms:
-            kind, style = _KINDS.get(flag.severity, ("note", ""))
-            lines += wrapped(f"{name}{kind}: {flag.meaning}", style, width)
-            if flag.remedy and with_remedy:
-                lines += wrapped(f"  -> {flag.remedy}", "", width)
-        if len(lines) <= room:
-            return lines
+    for said, remedy in found:
+        lines += said
+        if len(remedy) <= left:
+            lines += remedy
+            left -= len(remedy)
     return cut(lines, room)
 
 

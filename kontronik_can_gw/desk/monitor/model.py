@@ -59,10 +59,10 @@ QUANTITIES = (
     Quantity("battery_voltage", "battery voltage", 2, "V"),
     Quantity("battery_current", "battery current", 1, "A"),
     Quantity("power_stage_temperature", "power stage", 0, "°C", 80, 100),
-    Quantity("battery_power", "power", 0, "W"),
     Quantity("mean_cell_voltage", "cell voltage", 2, "V cell", 3.5, 3.3),
-    Quantity("throttle", "throttle", 0, "thr %"),
     Quantity("consumed_charge", "charge", 0, "mAh"),
+    Quantity("battery_power", "power", 0, "W"),
+    Quantity("throttle", "throttle", 0, "thr %"),
     Quantity("bec_temperature", "BEC", 0, "BEC °C", 80, 100),
     Quantity("output_opening", "opening", 0, "open %"),
     Quantity("motor_current", "motor current", 1, "A motor"),
@@ -73,6 +73,9 @@ QUANTITIES = (
     Quantity("bec_voltage", "BEC voltage", 2),
     Quantity("bec_current", "BEC current", 2),
 )
+
+
+_QUIET = "Quiet"
 
 
 class Track:
@@ -165,6 +168,8 @@ class Monitor:
         self.escs = tuple(escs)
         self.frame_rate: float | None = None
         """Frames of the layout in the last second. None during the first second."""
+        self.is_quiet = False
+        """True after the gateway's last state was Quiet: it sends nothing until an ESC is heard."""
         self._start: int | None = None
         self._now = -LATEST_NS
         """The present time. Times before the trigger of a log are negative."""
@@ -189,6 +194,8 @@ class Monitor:
             return
         now = self.advance(now)
         decoded = self.view.take(frame.key, frame.data, now)
+        if decoded:
+            self.is_quiet = normalize(self.gateway.text("gateway_state") or "") == "quiet"
         for first, values in decoded or ():
             self._missing.discard(first)
             for column, raw in enumerate(values, first):
@@ -243,6 +250,11 @@ class Monitor:
         return 0 if last_ns is None else max(0, self._now - last_ns)
 
     @property
+    def gateway_state(self) -> str | None:
+        """The gateway's state. A quiet gateway does not repeat it."""
+        return _QUIET if self.is_quiet else self.gateway.text("gateway_state")
+
+    @property
     def is_replay(self) -> bool:
         """True if the gateway reports that it plays a recording."""
         return normalize(self.gateway.text("gateway_state") or "") == "replay"
@@ -255,7 +267,7 @@ class Monitor:
         return {
             "frames": self.view.frames,
             "gateway": {
-                "state": self.gateway.text("gateway_state"),
+                "state": self.gateway_state,
                 "can_state": self.gateway.text("can_state"),
                 "uptime_s": self.gateway.number("uptime"),
             },

@@ -42,6 +42,8 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, Kind]]:
     elif source.ended and not monitor.view.frames:
         text = f"{source.name} contains no frame of {monitor.file}."
         yield f"{text} Give the DBC of its frames (-c, --dbc).", Kind.FAULT
+    elif monitor.is_quiet:
+        yield "the gateway is quiet: it sends again when an ESC is heard.", Kind.HINT
     elif monitor.silent_ns >= SILENCE_NS and not source.is_file:
         yield f"no {frames}", Kind.FAULT
         for hint in source.hints:

@@ -41,6 +41,8 @@ _NOTICE_STYLES = {
     Kind.HINT: "yellow",
     Kind.WAITING: "dim",
 }
+_FRESH_LINKS = ("ok", "degraded")
+"""States of a link with live data."""
 _PAGE_WIDTHS = (16, 5, 8, 8, 8)
 """Minimum widths of a page's columns: name, unit, value, minimum, maximum."""
 _HISTORY_WIDTHS = (16, 5, 8)
@@ -49,11 +51,10 @@ _HISTORIES = QUANTITIES[:4]
 """Quantities whose histories are shown below the table of all ESCs."""
 _NAME_WIDTH = 7
 _LINK_WIDTH = 9
-_STATE_WIDTH = 12
+_STATE_WIDTHS = (24, 19, 12, 10)
+"""Widths of the column of states, which are cut to it. The largest one that fits is used."""
 _VALUE_WIDTH = 5
-"""Minimum widths of the columns of the table of all ESCs. States are cut to their width."""
-_SHORT_STATE_WIDTH = 10
-"""Width of the states if names leave no room for the kept columns."""
+"""Minimum widths of the columns of the table of all ESCs."""
 _SHORTEST_STATE_WIDTH = 6
 """Width of the states if there is no room even with shortened names."""
 _LAST_KEPT = next(i for i, each in enumerate(QUANTITIES) if each.source == "consumed_charge")
@@ -112,8 +113,9 @@ def _table_body(escs: Sequence[Esc], width: int, room: int) -> list[Text]:
     """Return the table of all ESCs, and charts if there is room."""
     alarm_count = len(alarms(escs, width, _FEW_ALARM_LINES))
     body = cut(table_of(escs, width), max(2, room - alarm_count))
-    chart_room = room - _ALARM_LINES - len(body)
-    return body + _histories(escs, width, chart_room)
+    free = room - len(body)
+    shown_alarms = len(alarms(escs, width, _ALARM_LINES))
+    return body + _histories(escs, width, free - _ALARM_LINES, free - shown_alarms)
 
 
 def _title(monitor: Monitor, source: Source) -> Text:
@@ -124,7 +126,7 @@ def _title(monitor: Monitor, source: Source) -> Text:
         parts.append((f"  {source.progress}", "dim"))
     else:
         parts.append((f"  {monitor.file}", "dim"))
-    state = monitor.gateway.text("gateway_state")
+    state = monitor.gateway_state
     if state is not None:
         name = words(state)
         style = STATES.get(name, "yellow")
@@ -183,6 +185,8 @@ def _name_part(esc: Esc, width: int | None = None) -> Part:
 def _value_part(esc: Esc, quantity: Quantity) -> Part:
     """Return the present value, with a mark if it is beyond its limits."""
     value = esc.number(quantity.source)
+    if normalize(esc.link or "ok") not in _FRESH_LINKS:
+        value = None  # a total of the gateway, such as the energy
     text = number(value, quantity.digits)
     if value is None:
         return text, "dim"
@@ -266,13 +270,16 @@ def _page_head(esc: Esc) -> list[Text]:
     return [head, line((about, "dim"))]
 
 
-def _histories(escs: Sequence[Esc], width: int, height: int) -> list[Text]:
+def _histories(escs: Sequence[Esc], width: int, height: int, largest: int) -> list[Text]:
     """Return an empty line and charts of the most important quantities of all ESCs.
 
-    Empty if they do not fit.
+    They use ``height`` lines, so that their heights do not depend on alarms. If charts of one line
+    each do not fit, they use up to ``largest``. Empty without values and if they do not fit.
     """
-    known = [each for each in _HISTORIES if _is_supplied(each, escs)]
+    known = [each for each in _HISTORIES if _has_history(each, escs)]
     chart_lines = height - 2  # without the empty line and the head
+    if chart_lines < len(known) * len(escs):
+        chart_lines = largest - 2
     count = max(0, chart_lines) // max(1, len(escs))
     charts: list[tuple[Quantity, Esc]] = []
     for quantity in known[:count]:
@@ -298,6 +305,11 @@ def _histories(escs: Sequence[Esc], width: int, height: int) -> list[Text]:
         rows += chart_rows(cells, chart)
     least = (*widths, seconds)
     return [line(), *table(rows, width, 3, least)]
+
+
+def _has_history(quantity: Quantity, escs: Sequence[Esc]) -> bool:
+    """Return True if a chart of the quantity has at least one value of an ESC."""
+    return any(set(esc.tracks[quantity.source].history) - {None} for esc in escs)
 
 
 def _is_supplied(quantity: Quantity, escs: Sequence[Esc]) -> bool:
@@ -345,12 +357,12 @@ def _name_and_state_widths(escs: Sequence[Esc], room: int) -> tuple[int, int]:
     If there is not enough room, the smallest widths are returned.
     """
     names = _widest([_name_part(esc) for esc in escs], _NAME_WIDTH)
-    for state in (_STATE_WIDTH, _SHORT_STATE_WIDTH):
+    for state in _STATE_WIDTHS:
         if names + state <= room:
             return names, state
-    if room >= _NAME_WIDTH + _SHORT_STATE_WIDTH:
-        return room - _SHORT_STATE_WIDTH, _SHORT_STATE_WIDTH
-    state = min(_SHORT_STATE_WIDTH, room - _NAME_WIDTH)
+    if room >= _NAME_WIDTH + state:
+        return room - state, state
+    state = min(state, room - _NAME_WIDTH)
     return _NAME_WIDTH, max(_SHORTEST_STATE_WIDTH, state)
 
 

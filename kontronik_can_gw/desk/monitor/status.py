@@ -17,6 +17,7 @@ from kontronik_can_gw.capture.format import event_in_words
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.member import Alarm, Flag, alarms_of
 from kontronik_can_gw.desk.monitor.lines import (
+    NO_BREAK,
     STATES,
     Part,
     alarm_lines,
@@ -99,6 +100,18 @@ def published_files() -> list[Path]:
 
 def _service_files() -> list[Path]:
     return sorted(folders.RUN.glob(f"{PROGRAM}*/{folders.STATUS_FILE}"))
+
+
+def is_quiet_on(channel: str, now: int) -> bool:
+    """Return True if a gateway of this machine on this CAN interface is in quiet mode."""
+    for file in published_files():
+        seen = look_at(file, now)
+        document = seen.document
+        if document is None or seen.code == NOT_RUNNING:
+            continue
+        if document["can"]["channel"] == channel and document["gateway"]["state"] == "quiet":
+            return True
+    return False
 
 
 def possible_files(config: Path | None) -> list[Path]:
@@ -272,8 +285,8 @@ def _head(seen: Seen, document: Document) -> Iterator[Text]:
     style = "bold green" if seen.code == HEALTHY else "bold yellow"
     state = (seen.sentence, style)
     up = _duration(process["uptime_s"])
-    escs = f"{gateway['escs_ok']} of {gateway['esc_count']} ESCs heard, up {up}"
-    yield line(f"{PROGRAM} {document['version']}  ", state, f"  {escs}")
+    heard = _heard(gateway["escs_ok"], gateway["esc_count"])
+    yield line(f"{PROGRAM} {document['version']}  ", state, f"  {heard}, up {up}")
     memory = f"{process['rss_bytes'] // 1_000_000} MB"
     yield line((f"process {process['pid']}, {memory}, {document['configuration']}", "dim"))
     if "core" in gateway:  # documents of 0.5.0 do not have it
@@ -283,6 +296,12 @@ def _head(seen: Seen, document: Document) -> Iterator[Text]:
     clock = document.get("clock")
     if clock:  # documents of 0.5.0 do not have it
         yield from wrapped(f"clock: {_clock(clock)}", _CLOCK_STYLES[clock["synchronized"]], _WIDTH)
+
+
+def _heard(heard: int, count: int) -> str:
+    if count == 1:
+        return "ESC heard" if heard else "ESC not heard"
+    return f"{heard} of {count} ESCs heard"
 
 
 def _clock(clock: Document) -> str:
@@ -316,7 +335,10 @@ def _can_lines(document: Document) -> Iterator[Text]:
         "can_restarts": "restarts",
         "id_conflicts": "id conflicts",
     }
-    counts = ", ".join(f"{number(can['counters'][key])} {label}" for key, label in labels.items())
+    counts = ", ".join(
+        f"{number(can['counters'][key])} {label}".replace(" ", NO_BREAK)
+        for key, label in labels.items()
+    )
     yield from wrapped(f"     total: {counts}", "dim", _WIDTH)
 
 

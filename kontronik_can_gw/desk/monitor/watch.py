@@ -15,9 +15,10 @@ from rich.live import Live
 from rich.text import Text
 
 from kontronik_can_gw.desk.monitor.lines import wrapped
-from kontronik_can_gw.desk.monitor.model import Monitor
+from kontronik_can_gw.desk.monitor.model import SILENCE_NS, Monitor
 from kontronik_can_gw.desk.monitor.notices import notices
 from kontronik_can_gw.desk.monitor.screen import alarms, screen, table_of
+from kontronik_can_gw.desk.monitor.status import is_quiet_on
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
@@ -44,13 +45,23 @@ def watch(source: Source, monitor: Monitor, stopped: Stopped) -> None:
         _lines(source, monitor, stopped)
 
 
+def _look_for_quiet(source: Source, monitor: Monitor) -> None:
+    """Ask the gateways of this machine whether one is quiet, if the bus is silent."""
+    if not source.is_file and monitor.silent_ns >= SILENCE_NS and not monitor.is_quiet:
+        monitor.is_quiet = is_quiet_on(source.name, source.now())
+
+
 def _live(console: Console, source: Source, monitor: Monitor, stopped: Stopped) -> None:
     """Draw the screen at a fixed rate, and after each key."""
     page = 0
     due = time.monotonic()
+    look_due = due
     with _keys() as fd, Live(console=console, screen=True, auto_refresh=False) as live:
         while not stopped():
             now = time.monotonic()
+            if now >= look_due:
+                _look_for_quiet(source, monitor)
+                look_due = now + _LINES_S
             if now >= due:
                 lines = screen(monitor, source, console.size, page, fd is not None)
                 live.update(Text("\n").join(lines), refresh=True)
@@ -133,6 +144,7 @@ def _lines(source: Source, monitor: Monitor, stopped: Stopped) -> None:
         while time.monotonic() < due and not source.ended and not stopped():
             source.pump(monitor.take, due)
         monitor.advance(source.now())
+        _look_for_quiet(source, monitor)
         lines: list[Text] = []
         for text, _ in notices(monitor, source):
             lines += wrapped(text, "", 80)
@@ -145,7 +157,8 @@ def _lines(source: Source, monitor: Monitor, stopped: Stopped) -> None:
 def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> dict[str, Any]:
     """Return the document after all cyclic messages were received, or after ``timeout`` (s).
 
-    The document of a file shows its end. Raises RunError if no frame was received.
+    The document of a file shows its end. Raises RunError if no frame was received, unless a gateway
+    of this machine is quiet on this interface.
     """
     end = time.monotonic() + timeout
     while not stopped() and not source.ended:
@@ -154,7 +167,8 @@ def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> 
             break
         source.pump(monitor.take, now + REFRESH_S)
     monitor.advance(source.now())
-    if not monitor.view.frames and not stopped():
+    _look_for_quiet(source, monitor)
+    if not monitor.view.frames and not monitor.is_quiet and not stopped():
         file = monitor.file
         name = source.name
         if source.is_file:

@@ -157,7 +157,7 @@ class EscPort:
             data = port.read()
         except PortLost as error:
             self.close()
-            self._failed(f"{port.path}: lost ({error}).", now)
+            self._failed(f"{port.path}: lost ({error}). Check plug and power of the adapter.", now)
             return
         if data:
             if not noted.is_plain:
@@ -266,6 +266,7 @@ class EscLog:
         self.port_condition = f"{name}: port"
         """Name of the condition "the port is not open" in the fault log."""
         self._link_condition = f"{name}: telemetry"
+        self._device_condition = f"{name}: layout or device"
         self._quality_condition = f"{name}: line quality"
         self._diagnosis_condition = f"{name}: diagnosis"
         self._diagnosis_due = 0
@@ -332,7 +333,7 @@ class EscLog:
         elif conditions.is_on(self._quality_condition):
             conditions.end(self._quality_condition, said, now)
         else:
-            conditions.log(logging.INFO, said)
+            conditions.event(self._device_condition, said, now, logging.INFO)
 
     @property
     def diagnosis(self) -> str | None:

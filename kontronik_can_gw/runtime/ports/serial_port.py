@@ -117,7 +117,7 @@ class SerialPort:
         except OSError as error:
             raise PortLost(error.strerror or str(error)) from None
         if not data:
-            raise PortLost("hung up")
+            raise PortLost("unplugged")
         self.drained = not self._poll.poll(0)
         return data
 
