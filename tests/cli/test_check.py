@@ -185,3 +185,11 @@ def test_a_bad_certificate_is_explained_to_users(
     file = written(tmp_path / "g.toml", f'[can]\ninterface = "virtual"\n{table}{LEAST}')
     advice = "Certificates must be in PEM form, keys without passphrase."
     assert refused(2, "mqtt", "-c", file) == f"{tmp_path}/ca.pem: {said}. {advice}"
+
+
+def test_check_shows_who_can_restart_the_interface(tmp_path: Path) -> None:
+    text = "[can]\nrestart_after_s = 0.5\n[[esc]]\nport = '/dev/ttyS0'\n"
+    done = run("check", "-c", written(tmp_path / "gateway.toml", text))
+    assert done.code == 0
+    assert "restarted after 0.5 s in which no frame has left,\n" in done.out
+    assert "if root or the service's user runs the gateway\n" in done.out

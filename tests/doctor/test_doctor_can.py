@@ -209,4 +209,6 @@ def test_restarts_need_the_enabled_unit(tree: Tree, is_enabled: bool) -> None:
         (wants / unit).symlink_to("/etc/systemd/system/kontronik-can-gw-restart@.path")
     findings = check_can(tree, CanConfig(restart_after_s=0.5))
     assert ("can.restart_unit" in grave(findings)) == (not is_enabled)
+    said = only(findings, "can.restart_unit").text
+    assert "Only gateways of root and of the service's user can request a restart" in said
     assert "can.restart_unit" not in {each.check for each in check_can(tree, PLAIN)}
