@@ -2,7 +2,8 @@
 
 Vector's rules for communication descriptions and OEM templates define them: E2EProfile, E2EDataId
 (or E2EDataIds, DataIds) and E2EDataLength of a message or its signals, and GenSigFuncType of a
-signal. Case and underscores in their names do not matter.
+signal. Case and underscores in their names do not matter. Further names of data IDs are read, too,
+if their numbers fit the profile.
 """
 
 import re
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 _PROFILE = frozenset({"e2eprofile"})
 _DATA_IDS = frozenset({"e2edataid", "e2edataids", "e2edataidlist", "dataids", "dataidlist"})
+_LIKELY_DATA_IDS = frozenset({"dataid", "e2eid", "e2edataidentifier", "e2edataidentifiers"})
+"""Names that usually mean data IDs, but that no rule defines."""
 _LENGTH = frozenset({"e2edatalength"})
 _FUNCTION = frozenset({"gensigfunctype", "sigfunctype"})
 _UNPROTECTED = frozenset({"", "none", "no", "off", "noprofile", "notused", "unused", "0"})
@@ -63,12 +66,46 @@ def profile_of(message: "Message", database: "Database") -> Profile | None:
     return profile
 
 
+def unprotected(message: "Message", database: "Database") -> str | None:
+    """Return the text with which the DBC states that a message has no profile, or None."""
+    found = [str(text) for _, text in _values(message, database, _PROFILE)]
+    stated = [text for text in found if normalize(text)]
+    if stated and all(normalize(text) in _UNPROTECTED for text in stated):
+        return stated[0]
+    return None
+
+
 def data_ids_of(message: "Message", database: "Database") -> tuple[int, ...] | None:
-    """Return the data ids that the DBC states for a message, or None.
+    """Return the data IDs that the DBC states for a message, or None.
 
     They are a number or a text with numbers. Raises UnclearAttribute for another text.
     """
-    found = {str(value): name for name, value in _values(message, database, _DATA_IDS)}
+    return _numbers(_values(message, database, _DATA_IDS))
+
+
+def likely_data_ids_of(
+    message: "Message", database: "Database"
+) -> tuple[str, str, tuple[int, ...] | None] | None:
+    """Return name, text and numbers of an attribute that usually means data IDs, or None.
+
+    The numbers are None if they are unclear.
+    """
+    found = _values(message, database, _LIKELY_DATA_IDS)
+    if not found:
+        return None
+    name, value = found[0]
+    try:
+        return name, str(value), _numbers(found)
+    except UnclearAttribute:
+        return name, str(value), None
+
+
+def _numbers(attributes: Sequence[tuple[str, Any]]) -> tuple[int, ...] | None:
+    """Return the numbers in the only value of these attributes. None without attributes.
+
+    Raises UnclearAttribute for several values, and for another text than numbers.
+    """
+    found = {str(value): name for name, value in attributes}
     if not found:
         return None
     if len(found) > 1:
@@ -83,13 +120,13 @@ def data_ids_of(message: "Message", database: "Database") -> tuple[int, ...] | N
 
 
 def with_data_ids(attributes: Mapping[str, object], data_ids: Sequence[int]) -> dict[str, object]:
-    """Return attributes of a message or signal with other data ids, if they contain data ids.
+    """Return attributes of a message or signal with other data IDs, if they contain data IDs.
 
     Numbers stay numbers, and texts become decimal lists.
     """
     changed = dict(attributes)
     for name, value in attributes.items():
-        if normalize(name) in _DATA_IDS:
+        if normalize(name) in _DATA_IDS | _LIKELY_DATA_IDS:
             is_number = isinstance(value, (int, float)) and len(data_ids) == 1
             changed[name] = data_ids[0] if is_number else ", ".join(map(str, data_ids))
     return changed

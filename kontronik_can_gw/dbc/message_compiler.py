@@ -50,11 +50,13 @@ def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
     if problem:
         job.problems.append(f"{where}: {problem}")
         return None
+    known = len(job.problems)
     stated = stated_protection(job, copy)
+    is_unclear = stated is None and len(job.problems) > known
     signals = _signals(job, copy, stated)
     job.problems += _placement_problems(message, where)
     job.problems += _page_problems(message, pages, signals, where)
-    protection = message_protection(job, copy, signals, stated)
+    protection = None if is_unclear else message_protection(job, copy, signals, stated)
     if len(job.problems) > before:
         return None
     return MessagePlan(

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.dbc.copies import Copy
@@ -43,6 +44,14 @@ _LAST_WORDS = {
 """Words that are too short to be endings, because other words end with them, too."""
 _WHOLE = {"counter", "cntr", "cnt", "ctr"}
 """Names that mean a frame counter only without a prefix. An ErrorCounter does not count frames."""
+BOUND = {Role.ALIVE: "alive", Role.CRC: "crc"}
+"""Names in [dbc.bind] of a frame counter and a checksum."""
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_PARTS = {
+    Role.ALIVE: {"aliv", "alivecnt", "alivecounter", "alivcnt", "cntalive", *_ENDINGS[Role.ALIVE]},
+    Role.CRC: {"chks", *_ENDINGS[Role.CRC]},
+}
+"""Words that anywhere in a name suggest a frame counter or a checksum."""
 
 
 def esc_prefix(name: str) -> str:
@@ -57,12 +66,22 @@ def esc_prefix(name: str) -> str:
 def protection(name: str) -> Role | None:
     """Return ALIVE or CRC if a signal's name or binding has this meaning."""
     letters = normalize(name)
-    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)
+    words = _WORD.findall(name)
     last = words[-1].casefold() if words else ""
     for role, endings in _ENDINGS.items():
         if letters.endswith(endings) or last in _LAST_WORDS[role]:
             return role
     return Role.ALIVE if letters in _WHOLE else None
+
+
+def likely_protection(name: str) -> Role | None:
+    """Return ALIVE or CRC if some adjacent words of a signal's name suggest this meaning."""
+    words = _WORD.findall(name)
+    for role, parts in _PARTS.items():
+        for first, last in combinations(range(len(words) + 1), 2):
+            if "".join(words[first:last]).casefold() in parts:
+                return role
+    return None
 
 
 def is_data_id(name: str) -> bool:

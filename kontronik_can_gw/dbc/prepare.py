@@ -19,7 +19,8 @@ from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.message_compiler import compile_message
 from kontronik_can_gw.dbc.names import Binder
-from kontronik_can_gw.dbc.reader import choose_node, listed
+from kontronik_can_gw.dbc.protection import shared_data_ids
+from kontronik_can_gw.dbc.reader import choose_node, listed, require_own_messages
 from kontronik_can_gw.dbc.signal_compiler import Compilation
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -54,6 +55,7 @@ def prepare(
     example the CANopen nodes with their COB-IDs. Raises UserError with all mistakes together.
     """
     node = choose_node(database, settings.node, file, settings.messages)
+    require_own_messages(database, node, file, settings.messages)
     copies = copies_of(database, file, escs, settings)
     ours = [copy for copy in copies if node in copy.message.senders]
     job = Compilation(database, file, settings, Binder(escs, settings.bind), fd_allowed)
@@ -69,6 +71,7 @@ def prepare(
         )
     if job.problems:
         raise UserError(*dict.fromkeys(job.problems))
+    job.warnings += shared_data_ids(file, plans)
     job.warnings += _timing_warnings(job, plans)
     warnings = dict.fromkeys(job.warnings)
     return Layout(file, node, tuple(plans), tuple(warnings))

@@ -13,21 +13,23 @@ from kontronik_can_gw.dbc import e2e_attributes
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.e2e_attributes import UnclearAttribute
 from kontronik_can_gw.dbc.names import is_e2e
+from kontronik_can_gw.dbc.reader import listed
 from kontronik_can_gw.dbc.signal_compiler import Compilation
 from kontronik_can_gw.signals.e2e import DATA_IDS, PROFILES, DataIdMode, Profile, Protection
-from kontronik_can_gw.signals.plan import Role, SignalPlan
+from kontronik_can_gw.signals.plan import MessagePlan, Role, SignalPlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
 _DEFAULT = PROFILES["1A"]
-"""The profile of a message whose configuration names only a data id."""
+"""The profile of a message whose configuration names only a data ID."""
 
 
 def stated_protection(job: Compilation, copy: Copy) -> Protection | None:
     """Return the protection that configuration or DBC state for a message. None if neither does.
 
-    Adds a line to ``job.problems`` for a statement that is unclear or incomplete.
+    Adds a line to ``job.problems`` for a statement that is unclear or incomplete. A protection
+    without its data ID is returned nevertheless, so that the message's signals can be checked.
     """
     where = f"{job.file}: {copy.message.name}"
     try:
@@ -40,14 +42,12 @@ def stated_protection(job: Compilation, copy: Copy) -> Protection | None:
             f"{where}: {error} Name the profile: {_profile_key(copy)}, "
             "or leave the message out (dbc.messages)."
         )
+        job.protected.update(keys_of(copy, tuple(job.settings.e2e)))
         return None
-    before = len(job.problems)
     if is_of_dbc:
         job.problems += _length_problems(job, copy, where)
     job.problems += _data_id_problems(copy, profile, data_ids, where)
-    if len(job.problems) > before:
-        return None
-    return Protection(profile, data_ids)
+    return Protection(profile, data_ids or (0,))
 
 
 def keys_of(copy: Copy, patterns: Sequence[str]) -> list[str]:
@@ -86,22 +86,97 @@ def stated_data_ids(
     copy: Copy,
     profile: Profile,
 ) -> tuple[int, ...]:
-    """Return the data ids of a message. Empty if they are not stated.
+    """Return the data IDs of a message. Empty if they are not stated.
 
-    The DBC's data id is not used for copies for several ESCs, because a data id identifies one
-    message. The default of profile 1A is the CAN id.
+    The DBC's data ID is not used for copies for several ESCs, because a data ID identifies one
+    message. The default of profile 1A is the CAN id. Raises UnclearAttribute.
     """
     configured = settings.e2e_data_ids.get(copy.name)
     if configured is not None:
         return (configured,) if isinstance(configured, int) else tuple(configured)
-    found = None if copy.prefix else e2e_attributes.data_ids_of(copy.message, database)
-    if found is not None:
-        return found
-    return can_id_as_data_id(copy) if profile.name == _DEFAULT.name else ()
+    if not copy.prefix:
+        found = e2e_attributes.data_ids_of(copy.message, database)
+        if found is not None:
+            return found
+        likely = e2e_attributes.likely_data_ids_of(copy.message, database)
+        if likely is not None and _is_usable(likely[2], profile):
+            return likely[2] or ()
+    return _can_id_as_data_id(copy) if profile.name == _DEFAULT.name else ()
 
 
-def can_id_as_data_id(copy: Copy) -> tuple[int, ...]:
+def assumed_data_ids(settings: DbcConfig, database: "Database", copy: Copy) -> tuple[int, ...]:
+    """Return the data ID of a message whose profile 1A is only assumed.
+
+    It is the DBC's data ID, or the CAN id if that cannot be used.
+    """
+    try:
+        found = stated_data_ids(settings, database, copy, _DEFAULT)
+    except UnclearAttribute:
+        return _can_id_as_data_id(copy)
+    return found if _is_usable(found, _DEFAULT) else _can_id_as_data_id(copy)
+
+
+def _is_usable(data_ids: Sequence[int] | None, profile: Profile) -> bool:
+    """Return True for data IDs of a number and size that the profile needs."""
+    if data_ids is None or len(data_ids) != profile.ids:
+        return False
+    return max(data_ids) <= profile.largest_id
+
+
+def _can_id_as_data_id(copy: Copy) -> tuple[int, ...]:
     return (copy.frame_id & 0xFFFF,)
+
+
+def _data_id_warnings(job: Compilation, copy: Copy, sent: Protection) -> Iterator[str]:
+    """Yield a warning if the DBC states a data ID that is not used, or one of an unusual name."""
+    if copy.name in job.settings.e2e_data_ids:
+        return
+    where = f"{job.file}: {copy.message.name}"
+    name = "E2EDataId"
+    try:
+        stated = e2e_attributes.data_ids_of(copy.message, job.database)
+        text = " ".join(f"0x{data_id:X}" for data_id in stated or ())
+    except UnclearAttribute as error:
+        stated, text = (), str(error)
+    if stated is None:
+        likely = e2e_attributes.likely_data_ids_of(copy.message, job.database)
+        if likely is None:
+            return
+        name, text, stated = likely
+    key = f"dbc.e2e_data_ids.{copy.name}"
+    used = ", ".join(f"0x{data_id:X}" for data_id in sent.data_ids)
+    value = used if len(sent.data_ids) == 1 else f"[{used}]"
+    if stated == sent.data_ids:
+        if name != "E2EDataId":
+            yield (
+                f"{where}: sent with the data ID of the attribute {name}, {text[:80]}. "
+                f"To confirm this, set {key} = {value}"
+            )
+        return
+    reason = "it does not fit the profile"
+    if copy.prefix:
+        reason = "each ESC's copy of the message needs its own"
+    yield (
+        f"{where}: {copy.name} is sent with the data ID {value}, not with the {name} of the DBC, "
+        f"{text[:80]}, because {reason}. Receivers must expect {value}: to confirm or change it, "
+        f"set {key} = {value}"
+    )
+
+
+def shared_data_ids(file: str, plans: Sequence[MessagePlan]) -> Iterator[str]:
+    """Yield a warning for each data ID of several messages, which receivers cannot tell apart."""
+    users: dict[tuple[int, ...], list[str]] = {}
+    for plan in plans:
+        if plan.e2e is not None:
+            users.setdefault(plan.e2e.data_ids, []).append(plan.name)
+    for data_ids, names in users.items():
+        if len(names) > 1:
+            shown = ", ".join(f"0x{data_id:X}" for data_id in data_ids)
+            yield (
+                f"{file}: {listed(names)} have the same data ID, {shown}, so a receiver does not "
+                "notice if one is received instead of another. Give each its own: "
+                f"dbc.e2e_data_ids.{names[-1]}"
+            )
 
 
 def _data_id_problems(
@@ -167,12 +242,20 @@ def message_protection(
         job.problems.append(
             f"{where}.{crc.name}: the DBC does not define how this checksum is computed. "
             f"Name its AUTOSAR E2E profile ({', '.join(PROFILES)}): {_profile_key(copy, '2')}. "
-            f"Profile 1A is also chosen by {_data_id_key(copy)}. "
+            f"Profile 1A is also chosen by {_data_id_key(copy, copy.frame_id & 0xFFFF)}. "
             "Otherwise bind it to a constant, if receivers take "
             "one, or leave the message out (dbc.messages)."
         )
         return None
     job.problems += _fit_problems(found.profile, crc, alive, signals, where)
+    job.warnings += _data_id_warnings(job, copy, found)
+    length = copy.message.length
+    if length > found.profile.max_bytes:
+        job.warnings.append(
+            f"{where}: has {length} bytes, but AUTOSAR allows at most {found.profile.max_bytes} "
+            f"for E2E profile {found.profile.name}, so its receivers may refuse it. "
+            "Shorten it, or use profile 5 (up to 4096 bytes)"
+        )
     return found
 
 
@@ -188,8 +271,8 @@ def _is_replaced(job: Compilation, copy: Copy) -> bool:
     return any(isinstance(each, (int, float)) for each in bound)
 
 
-def _data_id_key(copy: Copy) -> str:
-    return f"dbc.e2e_data_ids.{copy.name} = 0x{copy.frame_id & 0xFFFF:X}"
+def _data_id_key(copy: Copy, data_id: int) -> str:
+    return f"dbc.e2e_data_ids.{copy.name} = 0x{data_id:X}"
 
 
 def _assumed(
@@ -197,7 +280,8 @@ def _assumed(
 ) -> Protection | None:
     """Return profile 1A for a CRC that is bound to "crc", or that has a well-known name."""
     own = crc.name.removeprefix(copy.prefix)
-    protection = Protection(_DEFAULT, can_id_as_data_id(copy))
+    data_ids = assumed_data_ids(job.settings, job.database, copy)
+    protection = Protection(_DEFAULT, data_ids)
     if job.binder.bound(copy, own) is not None:
         return protection
     if len(alive) != 1 or [*_fit_problems(_DEFAULT, crc, alive, (), "")]:
@@ -206,9 +290,11 @@ def _assumed(
     if not is_e2e(own, str(job.binder.bound(copy, counter) or counter)):
         return None
     where = f"{job.file}: {copy.message.name}"
+    stated = e2e_attributes.unprotected(copy.message, job.database)
+    although = "" if stated is None else f", although its E2EProfile is {stated!r}"
     job.warnings.append(
-        f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1. To confirm this, set "
-        f"{_data_id_key(copy)}"
+        f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1{although}. To confirm this, set "
+        f"{_data_id_key(copy, data_ids[0])}"
     )
     return protection
 

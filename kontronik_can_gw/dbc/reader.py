@@ -5,10 +5,13 @@ is rewritten.
 """
 
 import fnmatch
+import logging
 import re
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 from kontronik_can_gw.dbc.bounds import MAX_BYTES, STRING, check_bounds
 from kontronik_can_gw.errors import UserError
@@ -32,6 +35,15 @@ _BYTE_ORDER = re.compile(
     r"(?:\bBO_\s+\d+\s+(?P<message>\w+)\s*:)|"
     r"\bSG_\s+(?P<signal>\w+)(?:\s+\w+)?\s*:\s*\d+\s*\|\s*\d+\s*@\s*(?P<order>\d+)"
 )
+_MESSAGE = re.compile(
+    r"^[ \t]*BO_\s+(?P<number>\d+)\s+(?P<name>\w+)\s*:\s*\d+\s+(?P<sender>\w+)[^\n]*"
+    r"(?P<signals>(?:\s*^[ \t]*SG_\s[^\n]*)*)",
+    re.MULTILINE,
+)
+"""A message with its signals."""
+_EMPTY_SIGNAL = re.compile(r"SG_\s+(\w+)(?:\s+\w+)?\s*:\s*\d+\s*\|\s*0+\s*@")
+_NO_MESSAGE = "VECTOR__INDEPENDENT_SIG_MSG"
+"""The name under which tools keep signals without a message. cantools ignores it."""
 NO_NODE = "Vector__XXX"
 """The transmitter in a DBC of a message that has no transmitter."""
 _NAME = r'("\0\d+\0")'
@@ -59,6 +71,17 @@ _FRACTION = re.compile(
 _TEXT_VALUE = re.compile(rf"^([ \t]*BA_\s+){_NAME}(\s[^\";]*){_NAME}(\s*;)", re.MULTILINE)
 
 
+class LeftOut(NamedTuple):
+    """A message that cannot exist on a bus, so it was left out of a DBC."""
+
+    name: str
+    sender: str
+    reason: str
+
+
+_LEFT_OUT: "WeakKeyDictionary[Database, list[LeftOut]]" = WeakKeyDictionary()
+
+
 def load_database(path: Path, warnings: list[str] | None = None) -> "Database":
     """Read a DBC file with ``parse_database``.
 
@@ -83,8 +106,9 @@ def parse_database(
 ) -> "Database":
     """Parse the bytes of a DBC file.
 
-    Entries that refer to missing signals, tables or attributes are ignored, with a line in
-    ``warnings``. Raises UserError with one line that begins with ``path`` if it is not a DBC.
+    Entries that refer to missing signals, tables or attributes are ignored, and messages that
+    cannot exist are left out, each with a line in ``warnings``. Raises UserError with one line that
+    begins with ``path`` if it is not a DBC.
     """
     if len(raw) > MAX_BYTES:
         raise UserError(
@@ -103,10 +127,8 @@ def parse_database(
     with without_asammdf():
         import cantools.database
 
+    logging.getLogger("cantools").addHandler(logging.NullHandler())  # _equal_messages reports them
     rewriting = _Rewriting(text, path)
-    if warnings is not None:
-        for reason, entries in rewriting.ignored.items():
-            warnings.append(f"{path}: ignored entries {reason}: {listed(entries)}")
     try:
         database = cantools.database.load_string(
             rewriting.result,
@@ -120,9 +142,45 @@ def parse_database(
         raise UserError(f"{path}: cannot be read as a DBC: {reason}") from None
     if not isinstance(database, cantools.database.Database):
         raise UserError(f"{path}: is not a CAN database")
-    if not database.messages:
+    if not database.messages and not rewriting.left_out:
         raise UserError(f"{path}: has no messages. Is it a DBC?")
+    _LEFT_OUT[database] = rewriting.left_out
+    if warnings is not None:
+        for reason, entries in rewriting.ignored.items():
+            warnings.append(f"{path}: ignored entries {reason}: {listed(entries)}")
+        texts = [f"{each.name} ({each.sender}) {each.reason}" for each in rewriting.left_out]
+        if texts:
+            warnings.append(f"{path}: left out messages that cannot be sent: {listed(texts)}")
+        warnings += (f"{path}: {text}" for text in _equal_messages(database))
     return database
+
+
+def _equal_messages(database: "Database") -> Iterator[str]:
+    """Yield a line about names, and a line about ids, that several messages have."""
+    names = Counter(message.name for message in database.messages)
+    equal = [name for name, count in names.items() if count > 1]
+    if equal:
+        yield f"several messages have the same name: {listed(equal)}"
+    keys = Counter((each.frame_id, each.is_extended_frame) for each in database.messages)
+    ids = [f"{can_id:X}h" for (can_id, _), count in keys.items() if count > 1]
+    if ids:
+        yield f"several messages have the same id: {listed(ids)}"
+
+
+def require_own_messages(
+    database: "Database", node: str, file: str, patterns: Sequence[str] = ()
+) -> None:
+    """Raise UserError if messages of the gateway's node were left out of the DBC.
+
+    ``patterns`` are the names of the messages to send. Empty: all messages of the node.
+    """
+    problems = []
+    for name, sender, reason in _LEFT_OUT.get(database, ()):
+        is_chosen = any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns or "*")
+        if sender == node and is_chosen:
+            problems.append(f"{file}: {name}: {reason}. Correct it.")
+    if problems:
+        raise UserError(*problems)
 
 
 class _Rewriting:
@@ -132,6 +190,7 @@ class _Rewriting:
     2. The text of an enumeration attribute is replaced by its number.
     3. Entries for missing signals, tables and attributes are removed, because cantools would refuse
        the whole file.
+    4. For the same reason, messages with an impossible id or a signal of 0 bits are removed.
 
     Strings are masked during the changes, so that comments and texts of values are not changed.
     Lines keep their numbers. Raises UserError for a text that is not in an attribute's enumeration.
@@ -142,9 +201,12 @@ class _Rewriting:
         self._strings: list[str] = []
         self.ignored: dict[str, list[str]] = {}
         """The removed entries by reason."""
+        self.left_out: list[LeftOut] = []
+        self._left_out_numbers: set[str] = set()
         text = re.sub(STRING, self._mask, text)
         text = _BAUD_RATE.sub(r"\1", text)
         self._check_byte_orders(text)
+        text = _MESSAGE.sub(self._without_impossible, text)
         text = self._with_tables(text)
         text = self._without_undefined_attributes(text)
         text = self._with_fractions(text)
@@ -162,6 +224,26 @@ class _Rewriting:
                     f"byte order {found['order']} is neither 0 (Motorola) nor "
                     "1 (Intel). Write @0 or @1. SIG_VALTYPE_ declares floats."
                 )
+
+    def _without_impossible(self, found: re.Match[str]) -> str:
+        """Return a message unchanged, or the line ends of a message that is left out."""
+        number, name, sender, signals = found.group("number", "name", "sender", "signals")
+        empty = _EMPTY_SIGNAL.search(signals)
+        can_id = int(number) & 0x7FFFFFFF
+        limit = 0x1FFFFFFF if int(number) >> 31 else 0x7FF
+        if empty:
+            reason = f"has a signal of 0 bits, {empty[1]}"
+        elif can_id > limit:
+            reason = f"has the id {can_id:X}h, which is beyond {limit:X}h"
+            if limit == 0x7FF and can_id <= 0x1FFFFFFF:
+                reason += f" (a 29-bit id is written with bit 31 set: {can_id | 1 << 31})"
+        else:
+            return found[0]
+        if name == _NO_MESSAGE:
+            return found[0]
+        self.left_out.append(LeftOut(name, sender, reason))
+        self._left_out_numbers.add(number.lstrip("0") or "0")
+        return "\n" * found[0].count("\n")
 
     def _mask(self, found: re.Match[str]) -> str:
         self._strings.append(found[0])
@@ -194,6 +276,8 @@ class _Rewriting:
             if number is not None:
                 entry = f"{keyword} {number} {name}"
                 key = (number.lstrip("0") or "0", name)
+                if key not in signals and key[0] in self._left_out_numbers:
+                    return "\n" * found[0].count("\n")
                 if key not in signals:
                     return self._remove(found, "for signals that are not in the file", entry)
             table = body.strip()
@@ -278,7 +362,7 @@ def choose_node(
             if any(fnmatch.fnmatchcase(message.name, pattern) for pattern in patterns):
                 message.senders.append(NO_NODE)
         return NO_NODE
-    found: set[str] = set()
+    found = {each.sender for each in _LEFT_OUT.get(database, ())} - {NO_NODE}
     for message in database.messages:
         found.update(message.senders)
     senders = sorted(found)

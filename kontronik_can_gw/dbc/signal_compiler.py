@@ -12,7 +12,7 @@ from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.dbc.raw_values import ValueTable, exact, raw_range
 from kontronik_can_gw.dbc.reader import attribute, listed
-from kontronik_can_gw.esc.values import Group, Value
+from kontronik_can_gw.esc.values import Divisor, Group, Value
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.e2e import DataIdMode, Protection
 from kontronik_can_gw.signals.packer import float_bits
@@ -243,9 +243,29 @@ class SignalCompiler:
             return replace(plan, constant=self._start_value(plan), unbound=True)
         if bound is None:
             self.job.unbound.add(self._where)
-        via = "" if bound is None else f" (bound by dbc.bind to {bound!r})"
+        raise UnfitSignal(self._without_meaning(name, bound is not None))
+
+    def _without_meaning(self, name: str, is_bound: bool) -> str:
+        """Return the reason for a signal whose name, or the name it is bound to, is unknown."""
+        key = f"dbc.bind.{self.signal.name}"
+        if is_bound:
+            hints = self.job.binder.suggestions(name)
+            return f'no such source (bound by dbc.bind to "{name}").{hints} Correct {key}.'
+        if names.is_data_id(name) and self.signal.length == 4:
+            return (
+                "is the name of 4 bits of an E2E data ID, which only the profiles 1C and 11C send. "
+                f'Name the profile: dbc.e2e.{self.copy.name} = "1C", or bind it to a constant: '
+                f"{key} = 0."
+            )
+        role = names.likely_protection(name)
+        if role is not None:
+            noun = "checksum" if role is Role.CRC else "frame counter"
+            return (
+                f"no such source. If it is the message's {noun}, bind it: "
+                f'{key} = "{names.BOUND[role]}".'
+            )
         hints = self.job.binder.suggestions(name)
-        raise UnfitSignal(f"no such source{via}.{hints} Bind it under [dbc.bind] or rename it.")
+        return f"no such source.{hints} Bind it under [dbc.bind] or rename it."
 
     def _is_data_id(self, name: str) -> bool:
         """Return True if the signal contains a part of the data id of an E2E profile."""
@@ -350,9 +370,14 @@ def _bound_plan(
             raise UnfitSignal(
                 f"{value.name} is a counter, which needs factor 1, offset 0 and a minimum of 0."
             )
-        notes.append(f"starts again at 0 after {high}")
+        notes.append(f"restarts at 0 after {high}")
     elif not plan.is_float and not numbers:
         _check_codes_of_number(plan, table)
+        if abs(slope) > 1 and value.divisor is Divisor.ONE and value.bit is None:
+            step = raw_values.text(abs(slope * plan.factor))
+            notes.append(
+                f"changes in steps of {step} {plan.unit}".rstrip() + ", as the value itself"
+            )
     has_no_code = not plan.is_float and table.not_available is None
     if has_no_code and low <= plan.not_available <= high:
         sent = raw_values.text(plan.not_available * plan.factor + plan.offset)

@@ -40,6 +40,8 @@ class Profile:
     """The CRC's byte in the frame. None: any."""
     counter_bits: int | None = None
     """Length of the counter, which begins in the byte after the CRC. None: any length and place."""
+    max_bytes: int = 30
+    """The longest message that the specification allows."""
 
     @property
     def crc_bytes(self) -> int:
@@ -75,6 +77,7 @@ _P5 = Profile(
     counters=256,
     mode=DataIdMode.LAST,
     counter_bits=8,
+    max_bytes=4096,
 )
 _P22 = Profile(
     name="22",
@@ -85,6 +88,7 @@ _P22 = Profile(
     counters=16,
     mode=DataIdMode.LIST,
     counter_bits=4,
+    max_bytes=32,
 )
 _ALL = (
     _P1,

@@ -606,3 +606,61 @@ def test_frames_with_a_cycle_of_a_fraction_keep_it_on_average() -> None:
         now = max(now, gateway.next_deadline())
     distances = {after - before for before, after in itertools.pairwise(times)}
     assert distances == {12_500_000}
+
+
+# --- messages that cannot exist
+
+
+@pytest.mark.parametrize(
+    ("number", "place", "words"),
+    [
+        (13274, "0|8@1+", "the id 33DAh, which is beyond 7FFh (a 29-bit id"),
+        (0xE0000001, "0|8@1+", "the id 60000001h, which is beyond 1FFFFFFFh"),
+        (100, "0|0@1+", "a signal of 0 bits, A"),
+    ],
+)
+@pytest.mark.parametrize("sender", ["Other", "Gateway"])
+def test_an_impossible_message_is_left_out_unless_the_gateway_sends_it(
+    number: int, place: str, words: str, sender: str
+) -> None:
+    text = f'{STATE}BO_ {number} Theirs: 8 {sender}\n{signal("A", place)}VAL_ {number} A 1 "x" ;\n'
+    if sender == "Gateway":
+        (line,) = refused(text)
+        assert line.startswith(f"{FILE}: Theirs: has {words}")
+        assert compiled(text, messages=["Power"])
+        return
+    warnings: list[str] = []
+    (message,) = parse_database(text.encode(), "my.dbc", warnings).messages
+    assert message.name == "Power"
+    (line,) = warnings
+    assert f"Theirs (Other) has {words}" in line
+    layout = compiled(text, node="Gateway")
+    assert [plan.name for plan in layout.messages] == ["Power"]
+
+
+def test_equal_names_and_ids_are_warnings_with_the_file_and_not_of_the_library(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    other = f"BO_ 100 Theirs: 8 Other\n{signal('A')}\n"
+    warnings: list[str] = []
+    parse_database((STATE + other + other).encode(), "my.dbc", warnings)
+    assert warnings == [
+        "my.dbc: several messages have the same name: Theirs",
+        "my.dbc: several messages have the same id: 64h",
+    ]
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("factor", "notes"),
+    [
+        ("0.05,0", ("changes in steps of 0.1 A, as the value itself",)),
+        ("0.1,0", ()),
+        ("1,0", ()),
+    ],
+)
+def test_a_factor_finer_than_the_value_is_noted(factor: str, notes: tuple[str, ...]) -> None:
+    text = MESSAGE + signal("BatteryCurrent", "0|16@1-", "A", factor, "-100|100")
+    (plan,) = compiled(text).messages
+    (only,) = plan.signals
+    assert only.notes == notes

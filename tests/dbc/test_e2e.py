@@ -571,3 +571,115 @@ def test_counter_and_crc_are_recognised_by_the_function_type_of_a_signal(definit
         "M_Seq": Role.ALIVE,
     }
     assert get(bytes(8), 0, 8, True) == 0
+
+
+# --- statements that are incomplete, unusual or contradictory
+
+
+def e2e_warnings(layout: Layout) -> list[str]:
+    return [line for line in layout.warnings if "data ID" in line or "E2E" in line]
+
+
+@pytest.mark.parametrize("name", ["DataID", "DataId", "E2EId", "E2EDataIdentifier"])
+def test_a_data_id_with_an_unusual_name_is_used_with_a_warning(name: str) -> None:
+    text = layout_text("1A") + attributes("P01", 7).replace("E2EDataId", name)
+    layout = compiled(text)
+    assert [plan.e2e for plan in layout.messages] == [protection("1A", 7)]
+    (line,) = e2e_warnings(layout)
+    assert f"the data ID of the attribute {name}, 7" in line
+    assert line.endswith("dbc.e2e_data_ids.M = 0x7")
+    assert not e2e_warnings(compiled(text, e2e_data_ids={"M": 7}))
+
+
+@pytest.mark.parametrize("value", ["x", "70000", "1, 2"])
+def test_an_unusual_name_with_an_unfit_data_id_changes_no_frame(value: str) -> None:
+    text = layout_text("1A") + attributes("P01", value).replace("E2EDataId", "DataID")
+    layout = compiled(text)
+    assert [plan.e2e for plan in layout.messages] == [protection("1A", 0x123)]
+    (line,) = e2e_warnings(layout)
+    assert f"not with the DataID of the DBC, {value}, because it does not fit" in line
+
+
+def test_copies_with_profile_1a_report_the_data_id_that_they_do_not_use() -> None:
+    text = layout_text("1A", value=Sig("BatteryVoltage", 32, 16, unit="V")) + attributes("P01", 7)
+    layout = compiled(text, ("left", "right"))
+    assert [plan.e2e for plan in layout.messages] == [
+        protection("1A", 0x123),
+        protection("1A", 0x124),
+    ]
+    left, right = e2e_warnings(layout)
+    assert "LeftM is sent with the data ID 0x123, not with the E2EDataId of the DBC, 0x7" in left
+    assert right.endswith("dbc.e2e_data_ids.RightM = 0x124")
+    confirmed = {"LeftM": 0x123, "RightM": 0x124}
+    assert not e2e_warnings(compiled(text, ("left", "right"), e2e_data_ids=confirmed))
+
+
+def test_an_assumed_profile_uses_the_data_id_of_the_dbc() -> None:
+    text = layout_text("1A").replace("M_BZ", "M_Alive") + attributes(None, 7)
+    layout = compiled(text)
+    assert [plan.e2e for plan in layout.messages] == [protection("1A", 7)]
+    (line,) = e2e_warnings(layout)
+    assert line.endswith("dbc.e2e_data_ids.M = 0x7")
+
+
+def test_equal_data_ids_of_several_messages_cause_one_warning() -> None:
+    ids = {"Motor_1": 5, "Motor_2": 5, "Other": 6}
+    (line,) = e2e_warnings(compiled(dbc_text(MESSAGES), e2e_data_ids=ids))
+    assert "Motor_1, Motor_2 have the same data ID, 0x5" in line
+
+
+@pytest.mark.parametrize(
+    ("name", "length", "most"),
+    [
+        ("1A", 24, None),
+        ("1A", 32, 30),
+        ("11C", 64, 30),
+        ("2", 32, None),
+        ("2", 48, 32),
+        ("22", 64, 32),
+        ("5", 64, None),
+    ],
+)
+def test_a_message_beyond_the_length_of_its_profile_causes_a_warning(
+    name: str, length: int, most: int | None
+) -> None:
+    text = layout_text(name).replace("BO_ 291 M: 8", f"BO_ 291 M: {length}")
+    lines = e2e_warnings(compiled(text, e2e={"M": name}, e2e_data_ids={"M": DATA_IDS[name]}))
+    assert len(lines) == (most is not None)
+    for line in lines:
+        assert f"has {length} bytes, but AUTOSAR allows at most {most} for E2E profile" in line
+
+
+def test_a_profile_that_is_stated_as_none_is_named_in_the_warning() -> None:
+    text = layout_text("1A").replace("M_BZ", "M_Alive") + attributes("none", None)
+    (line,) = e2e_warnings(compiled(text))
+    assert "sent as AUTOSAR E2E profile 1, although its E2EProfile is 'none'" in line
+
+
+@pytest.mark.parametrize("name", ["1B", "1C", "2", "5"])
+def test_a_message_that_lacks_only_its_data_id_gets_one_line(name: str) -> None:
+    (line,) = refused(layout_text(name), e2e={"M": name})
+    assert "it has none. Set dbc.e2e_data_ids.M" in line
+
+
+def test_a_nibble_without_a_profile_names_the_profile_as_remedy() -> None:
+    lines = refused(layout_text("1C"))
+    (line,) = [line for line in lines if "M_DataIDNibble" in line]
+    assert 'dbc.e2e.M = "1C"' in line
+    assert "no such source" not in line
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("CHKS_x", "crc"),
+        ("ALIV_x", "alive"),
+        ("Checksum_x", "crc"),
+        ("RollingCounter_x", "alive"),
+        ("x_AliveCnt1", "alive"),
+    ],
+)
+def test_a_name_like_a_checksum_or_counter_gets_the_binding_as_hint(name: str, role: str) -> None:
+    (line,) = refused(dbc_text([Msg("M", 0x123, 8, [Sig(name, 0, 8)])]))
+    assert line.endswith(f'bind it: dbc.bind.{name} = "{role}".')
+    assert "Did you mean" not in line

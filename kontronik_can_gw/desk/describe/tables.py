@@ -23,7 +23,7 @@ from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.esc.decoder import EscProtocol, State
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
-from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.esc.values import VALUES, Divisor, Group, Value
 from kontronik_can_gw.signals.packer import float_of
 from kontronik_can_gw.signals.plan import MessagePlan, Role, SendType, SignalPlan
 from kontronik_can_gw.status import CanState, GatewayState
@@ -157,7 +157,9 @@ def _signal(
     shows = plan.role.value
     if plan.source is not None:
         shows = plan.source.name
-    sentences = [_line(signal.comment), *_notes(message, plan)]
+    comment = _line(signal.comment)
+    notes = [note for note in _notes(message, plan) if note.lower() not in comment.lower()]
+    sentences = [comment, *notes]
     return {
         "signal": plan.name,
         "start": signal.start,
@@ -316,6 +318,7 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
         row = {
             "name": name,
             "unit": value.unit,
+            "resolution": _resolution(value),
             "available": available,
             "counter": value.rolls,
             "objects": objects_of.get(name, []),
@@ -343,6 +346,16 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
     ]
 
 
+def _resolution(value: Value) -> str:
+    """Return the steps of a value in its unit. Empty for a value without a unit."""
+    if not value.unit:
+        return ""
+    step = f"{1 / value.per_unit:.3g}"
+    if value.divisor is Divisor.ONE:
+        return step
+    return f"{step} / ({value.divisor.value.replace(' and ', ' x ')})"
+
+
 def _named(states: Mapping[Any, Text]) -> Iterator[tuple[int, str, Text]]:
     """Yield number, name and description of each state of the gateway."""
     for state, text in states.items():
@@ -351,6 +364,7 @@ def _named(states: Mapping[Any, Text]) -> Iterator[tuple[int, str, Text]]:
 
 _VALUES = (
     "Bind signals of your own DBC to these values, by name or in [dbc.bind]. Units may differ.",
+    "Column resolution: the steps of the value. A signal with a finer factor has these steps, too.",
     (
         "Column available: when the value is known. Otherwise its signal is sent as not available. "
         '"If known" marks a value that can be missing even then, for example because the device '

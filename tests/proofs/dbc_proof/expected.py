@@ -22,7 +22,7 @@ from dbc_proof.sending import Sending, attribute_of, has_own_attribute, sending_
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.e2e_attributes import role_of
 from kontronik_can_gw.dbc.names import Binder, is_data_id, protection
-from kontronik_can_gw.dbc.protection import stated_data_ids, stated_profile
+from kontronik_can_gw.dbc.protection import assumed_data_ids, stated_data_ids, stated_profile
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import Role
@@ -138,7 +138,7 @@ def _protection(
         return None
     profile, _ = stated_profile(settings, database, sent.for_binder)
     if profile is None:
-        return "1A", (sent.can_id & 0xFFFF,)
+        return "1A", assumed_data_ids(settings, database, sent.for_binder)
     return profile.name, stated_data_ids(settings, database, sent.for_binder, profile)
 
 
