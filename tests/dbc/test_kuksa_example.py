@@ -5,6 +5,8 @@ The provider is on no package index. kuksa_mapping.schema.json has the rules of 
 """
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -29,8 +31,19 @@ VSS = {
 }
 """Names of VSS with data type and unit, as in releases 4.0 to 6.0 of the specification."""
 PRIVATE = "Vehicle.Private.Esc."
-UNITS = {"1/min": "rpm", "degC": "celsius", "%": "percent", "mAh": "Ah"}
-"""Names in VSS for units of the DBC."""
+UNITS = {"1/min": "rpm", "degC": "", "%": "percent", "mAh": "Ah", "Wh": "kWh"}
+"""Names in VSS for units of the DBC. The name of degree Celsius differs between VSS 5 and 6."""
+UNITS_OF_VSS = {
+    "rpm": "rotational-speed",
+    "V": "voltage",
+    "A": "electric-current",
+    "W": "power",
+    "kWh": "work",
+    "Ah": "electric-charge",
+    "percent": "relation",
+}
+"""Units with the same name and quantity in releases 5.0 and 6.0 of VSS."""
+OVERLAY = FOLDER / "esc.vspec"
 
 
 def sensors(children: Any = MAPPING, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -91,6 +104,41 @@ def test_units_are_those_of_the_dbc() -> None:
         signal, _ = signal_of(node["dbc2vss"]["signal"])
         unit = UNITS.get(signal.unit, signal.unit) or None
         assert node.get("unit") == unit, name
+        assert unit is None or unit in UNITS_OF_VSS
+
+
+def nodes(children: Any = MAPPING, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield all nodes of the mapping with their full names, without their children."""
+    for name, node in children.items():
+        yield f"{prefix}{name}", {key: entry for key, entry in node.items() if key != "children"}
+        yield from nodes(node.get("children", {}), f"{prefix}{name}.")
+
+
+def test_the_overlay_has_the_nodes_of_the_mapping() -> None:
+    yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
+    assert yaml.safe_load(OVERLAY.read_text()) == dict(nodes())
+
+
+@pytest.mark.parametrize("celsius", ["celsius", "Celsius"])
+def test_vss_tools_accept_the_overlay(celsius: str, tmp_path: Path) -> None:
+    """``celsius`` is the name of this unit in VSS 5 or 6, which vss-tools read from a file."""
+    vspec = Path(sys.executable).with_name("vspec")
+    if not vspec.exists():
+        pytest.skip("vss-tools is not installed: pip install vss-tools")
+    units = {**UNITS_OF_VSS, celsius: "temperature"}
+    entry = "{{definition: x, unit: 'name of {}', quantity: {}, allowed-datatypes: [numeric]}}"
+    texts = {
+        "base.vspec": "Vehicle:\n  type: branch\n  description: The vehicle.\n",
+        "units.yaml": "\n".join(f"{key}: {entry.format(key, of)}" for key, of in units.items()),
+        "quantities.yaml": "\n".join(f"{of}: {{definition: x}}" for of in units.values()),
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    command = [str(vspec), "export", "json", "--strict"]
+    files = ["-s", "base.vspec", "-u", "units.yaml", "-q", "quantities.yaml", "-l", str(OVERLAY)]
+    more = ["-e", "dbc2vss", "-o", "out.json"]
+    subprocess.run([*command, *files, *more], cwd=tmp_path, check=True)
+    assert dict(sensors(json.loads((tmp_path / "out.json").read_text()))) == SENSORS
 
 
 @pytest.mark.parametrize("name", sorted(SENSORS))
@@ -101,7 +149,11 @@ def test_codes_for_not_available_are_not_passed_on_as_numbers(name: str) -> None
         if str(text) in ("NotAvailable", "Error"):
             value = decoded(signal.name, raw)
             assert isinstance(value, NamedSignalValue)
-            assert transformed(node, value) is None
+            found = transformed(node, value)
+            if "allowed" in node:
+                assert found in ("NOT_AVAILABLE", "ERROR")
+            else:
+                assert found is None
 
 
 @pytest.mark.parametrize(
@@ -114,6 +166,7 @@ def test_codes_for_not_available_are_not_passed_on_as_numbers(name: str) -> None
         ("Vehicle.Private.Esc.PowerStageTemperature", -5, -5),
         ("Vehicle.Private.Esc.IsUndervoltage", 0, False),
         ("Vehicle.Private.Esc.IsUndervoltage", 1, True),
+        ("Vehicle.Private.Esc.EnergyUsed", 100, 0.01),
         ("Vehicle.Private.Esc.LinkState", 4, "LOST"),
     ],
 )
