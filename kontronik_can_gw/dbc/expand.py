@@ -56,7 +56,7 @@ def copies_of(
         for index, esc in enumerate(escs):
             prefix = esc_prefix(esc.name)
             copies.append(Copy(message, distance + index * step, index, prefix))
-    problems = [f"{file}: {problem}" for problem in _problems(copies, node)]
+    problems = [f"{file}: {problem}" for problem in _problems(copies, node, settings)]
     if problems:
         raise UserError(*problems)
     return copies
@@ -109,17 +109,40 @@ def _chosen(
     return [message for message in database.messages if message.name in chosen]
 
 
-def _problems(copies: Sequence[Copy], node: str) -> Iterator[str]:
-    """Yield a line about ids out of range, and a line about names that are too long."""
-    ours = [copy for copy in copies if node in copy.message.senders]
+def _id_problem(ours: Sequence[Copy], settings: DbcConfig) -> str | None:
+    """Return the problem of messages that were moved beyond the last id. None without it."""
     outside = []
+    limits = set()
+    excess = 0
     for copy in ours:
         limit = 0x1FFFFFFF if copy.message.is_extended_frame else 0x7FF
-        if not 0 <= copy.frame_id <= limit:
-            outside.append(f"{copy.frame_id:X}h")
-    if outside:
-        problem = f"{len(outside)} of {len(ours)} ids are out of range: {listed(outside)}."
-        yield f"{problem} Use fewer ESCs or another dbc.base_id."
+        if copy.frame_id > limit:
+            outside.append(f"{copy.name} {copy.frame_id:X}h")
+            limits.add(f"{limit:X}h")
+            excess = max(excess, copy.frame_id - limit)
+    if not outside:
+        return None
+    lowest = min(copy.frame_id for copy in ours)
+    reasons = []
+    if settings.base_id is not None:
+        reasons.append(f"dbc.base_id = 0x{settings.base_id:X}")
+    if any(copy.prefix for copy in ours):
+        reasons.append("the distance between the ids of the ESCs, dbc.id_step,")
+    remedy = "Leave out messages with dbc.messages."
+    if excess <= lowest:
+        remedy = f"Set dbc.base_id to at most 0x{lowest - excess:X}, or leave out messages with "
+        remedy += "dbc.messages."
+    return (
+        f"{len(outside)} of {len(ours)} ids are beyond {' or '.join(sorted(limits))}, because "
+        f"{' and '.join(reasons)} moves them: {listed(outside)}. {remedy}"
+    )
+
+
+def _problems(copies: Sequence[Copy], node: str, settings: DbcConfig) -> Iterator[str]:
+    """Yield a line about ids out of range, and a line about names that are too long."""
+    problem = _id_problem([copy for copy in copies if node in copy.message.senders], settings)
+    if problem is not None:
+        yield problem
     names = []
     for copy in copies:
         if copy.prefix:

@@ -168,9 +168,7 @@ class Binder:
 
     def suggestions(self, name: str) -> str:
         """Return a sentence with the closest known names, or an empty string."""
-        key = normalize(name)
         for prefix, _ in self._prefixes:
-            key = key.removeprefix(prefix) or key
-        return did_you_mean(
-            key, VALUES_BY_KEY, 0.5, show=lambda near: VALUES_BY_KEY[near].name, count=3
-        )
+            if name.casefold().startswith(prefix) and len(name) > len(prefix):
+                name = name[len(prefix) :]
+        return did_you_mean(name, [value.name for value in VALUES_BY_KEY.values()], count=3)

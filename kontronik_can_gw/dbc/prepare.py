@@ -20,7 +20,7 @@ from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.message_compiler import compile_message
 from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.dbc.protection import shared_data_ids
-from kontronik_can_gw.dbc.reader import choose_node, listed, require_own_messages
+from kontronik_can_gw.dbc.reader import choose_node, listed, own_left_out
 from kontronik_can_gw.dbc.signal_compiler import Compilation
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -55,10 +55,11 @@ def prepare(
     example the CANopen nodes with their COB-IDs. Raises UserError with all mistakes together.
     """
     node = choose_node(database, settings.node, file, settings.messages)
-    require_own_messages(database, node, file, settings.messages)
+    left_out = own_left_out(database, node, file, settings.messages)
     copies = copies_of(database, file, escs, settings)
     ours = [copy for copy in copies if node in copy.message.senders]
     job = Compilation(database, file, settings, Binder(escs, settings.bind), fd_allowed)
+    job.problems += left_out
     plans = [*_compiled(job, ours)]
     job.problems += _clashes(copies, node, taken_ids or {}, file)
     job.problems += _unused_settings(job, ours, node)

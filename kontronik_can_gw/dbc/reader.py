@@ -71,6 +71,15 @@ _FRACTION = re.compile(
 _TEXT_VALUE = re.compile(rf"^([ \t]*BA_\s+){_NAME}(\s[^\";]*){_NAME}(\s*;)", re.MULTILINE)
 
 
+_OTHER_FORMATS = (
+    (re.compile(r"\s*FormatVersion\s*="), "a PCAN Symbol file (.sym)", "cantools convert"),
+    (re.compile(r"\s*<[^\0]{0,2000}?\bNetworkDefinition\b"), "a KCD", "cantools convert"),
+    (re.compile(r"\s*<[^\0]{0,2000}?\bAUTOSAR\b"), "an ARXML", "canconvert"),
+    (re.compile(r"[^\0]{0,2000}?\[DATABASE_VERSION\]"), "a DBF of BUSMASTER", "canconvert"),
+)
+"""Beginnings of databases in other formats, their names, and the programs that convert them."""
+
+
 class LeftOut(NamedTuple):
     """A message that cannot exist on a bus, so it was left out of a DBC."""
 
@@ -123,6 +132,7 @@ def parse_database(
         text = raw.decode("cp1252", errors="replace")
     if not text.strip():
         raise UserError(f"{path}: is empty, not a DBC")
+    _refuse_other_formats(text, path)
     check_bounds(text, path)
     with without_asammdf():
         import cantools.database
@@ -155,6 +165,17 @@ def parse_database(
     return database
 
 
+def _refuse_other_formats(text: str, path: str) -> None:
+    """Raise UserError with the converter for a database in another format."""
+    for beginning, name, program in _OTHER_FORMATS:
+        if beginning.match(text):
+            package = "cantools" if program.startswith("cantools") else "canmatrix"
+            raise UserError(
+                f"{path}: is {name}, not a DBC. Convert it with the Python package {package}: "
+                f"{program} {Path(path).name} {Path(path).stem}_converted.dbc"
+            )
+
+
 def _equal_messages(database: "Database") -> Iterator[str]:
     """Yield a line about names, and a line about ids, that several messages have."""
     names = Counter(message.name for message in database.messages)
@@ -167,20 +188,22 @@ def _equal_messages(database: "Database") -> Iterator[str]:
         yield f"several messages have the same id: {listed(ids)}"
 
 
-def require_own_messages(
+def own_left_out(
     database: "Database", node: str, file: str, patterns: Sequence[str] = ()
-) -> None:
-    """Raise UserError if messages of the gateway's node were left out of the DBC.
+) -> list[str]:
+    """Return a line for each message of the gateway's node that was left out of the DBC.
 
-    ``patterns`` are the names of the messages to send. Empty: all messages of the node.
+    ``patterns`` are the names of the messages to send. Empty: all messages of the node. Raises
+    UserError if no other message of the node is left.
     """
     problems = []
     for name, sender, reason in _LEFT_OUT.get(database, ()):
         is_chosen = any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns or "*")
         if sender == node and is_chosen:
             problems.append(f"{file}: {name}: {reason}. Correct it.")
-    if problems:
+    if problems and not any(node in message.senders for message in database.messages):
         raise UserError(*problems)
+    return problems
 
 
 class _Rewriting:

@@ -7,6 +7,7 @@ signals that are bound to no value.
 import itertools
 import json
 import math
+import re
 from dataclasses import replace
 from fractions import Fraction
 from typing import Any
@@ -21,6 +22,7 @@ from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.prepare import is_mute, reporter, unreported
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.desk.describe.tables import held
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import SEND_TYPES, Layout, Role, SendType
@@ -664,3 +666,24 @@ def test_a_factor_finer_than_the_value_is_noted(factor: str, notes: tuple[str, .
     (plan,) = compiled(text).messages
     (only,) = plan.signals
     assert only.notes == notes
+
+
+@pytest.mark.parametrize(
+    ("name", "beginning", "said"),
+    [
+        ("a.sym", "FormatVersion=6.0 // x\nTitle=x\n", "is a PCAN Symbol file (.sym), not a DBC"),
+        ("a.kcd", '<?xml version="1.0"?>\n<NetworkDefinition>', "is a KCD, not a DBC"),
+        ("a.kcd", "<NetworkDefinition>", "cantools: cantools convert a.kcd a_converted.dbc"),
+        ("a.arxml", '<?xml version="1.0"?>\n<AUTOSAR>', "is an ARXML, not a DBC"),
+        (
+            "a.dbf",
+            "//****BUSMASTER\n\n[DATABASE_VERSION] 1.3\n",
+            "canconvert a.dbf a_",
+        ),
+    ],
+)
+def test_a_database_of_another_format_is_named_with_its_converter(
+    name: str, beginning: str, said: str
+) -> None:
+    with pytest.raises(UserError, match=re.escape(said)):
+        parse_database(beginning.encode(), name)

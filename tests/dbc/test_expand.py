@@ -201,9 +201,20 @@ def test_ids_are_moved_by_the_smallest_step_without_a_clash(
         (simple(0x100, 0x101), PAIR, {"id_step": 1}, "dbc.id_step = 1 "),
         (simple(0x100, gateway=(0x110,)), PAIR, {"id_step": 0x10}, "clash"),
         (simple(0x100), PAIR, {"id_step": 0}, "clash"),
-        (simple(0x7FF), PAIR, {}, "1 of 2 ids are out of range: 800h"),
-        (simple(0x1FFFFFFF, extended=True), PAIR, {}, "out of range: 20000000h"),
-        (simple(0x100, 0x200, 0x700), ONE, {"base_id": 0x700}, "2 of 3 ids"),
+        (simple(0x7FF), PAIR, {}, "RightM0 800h. Set dbc.base_id to at most 0x7FE"),
+        (simple(0x1FFFFFFF, extended=True), PAIR, {}, "1 of 2 ids are beyond 1FFFFFFFh"),
+        (
+            simple(0x100, 0x200, 0x700),
+            ONE,
+            {"base_id": 0x700},
+            "0x700 moves them: EscM1 800h, EscM2 ",
+        ),
+        (
+            simple(0x0, 0x7FF),
+            PAIR,
+            {"id_step": 2},
+            "moves them: RightM1 801h. Leave out",
+        ),
     ],
 )
 def test_ids_that_clash_or_leave_their_range_are_refused(
