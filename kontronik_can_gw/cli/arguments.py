@@ -5,9 +5,10 @@ import tomllib
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from kontronik_can_gw.errors import UserError, did_you_mean
+from kontronik_can_gw.printable import printable
 
 REMOVED_OPTIONS: dict[tuple[str, str], str] = {}
 """The replacement of each removed option, by command and option."""
@@ -20,13 +21,18 @@ for _command, _rows in tomllib.loads(_removed_text).items():
 class Parser(argparse.ArgumentParser):
     """The parser of one command.
 
-    For a mistake it shows the usage of this command, and suggests the closest option.
+    For a mistake it prints one line, and suggests the closest option.
     """
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with a line that says how to get the help."""
+        sentence = message if message.endswith((".", "?")) else f"{message}."
+        self.exit(2, printable(f"{self.prog}: {sentence} Help: {self.prog} --help") + "\n")
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse arguments. Exits with the usage if an option does not exist.
+        """Parse arguments. Exits with an error if an option does not exist.
 
         So the returned list of remaining words is always empty.
         """

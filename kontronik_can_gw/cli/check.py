@@ -80,6 +80,8 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     if can.fd:
         rate += f", data {can.data_bitrate // 1000} kbit/s"
     yield f"  CAN       {can.channel} ({can.interface}), {rate}"
+    if can.restart_after_s:
+        yield f"            restarted after {can.restart_after_s:g} s in which no frame is sent"
     if can.quiet_after_s:
         yield f"            quiet after {can.quiet_after_s} s without telemetry"
     if can.restart_after_s and can.interface == "socketcan":

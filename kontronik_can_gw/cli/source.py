@@ -44,6 +44,12 @@ def recording_of(args: argparse.Namespace) -> Path | None:
             raise UserError(f"--channel {args.channel}: {name} names the interface. Leave one out.")
         args.channel = name or args.channel
         return None
+    for suffix, text, parameter in (
+        (".toml", "a configuration", "-c"),
+        (".dbc", "a DBC", "--dbc"),
+    ):
+        if name.endswith(suffix):
+            raise UserError(f"{name}: is {text}, not a recording. Give it with {parameter} {name}.")
     if args.interface is not None:
         raise UserError(f"{name}: is a recording, so --interface has no effect. Leave it out.")
     return Path(name)

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from kontronik_can_gw.cli import say
-from kontronik_can_gw.cli.arguments import JSON, default_config, option
+from kontronik_can_gw.cli.arguments import CONFIG, JSON, default_config, option
 from kontronik_can_gw.desk.monitor.status import (
     NOT_RUNNING,
     TROUBLE,
@@ -34,7 +34,7 @@ class NotRunning(RunError):
 
 OPTIONS = (
     (
-        option("-c --config FILE", "show the gateway with this TOML configuration", type=Path),
+        *CONFIG,
         option("--file FILE", "show the gateway with this statistics file", type=Path),
     ),
     JSON,

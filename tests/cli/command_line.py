@@ -58,9 +58,8 @@ def refused(code: int, *words: object, given: bytes | None = None) -> str:
     assert done.code == code, done
     assert done.out == "", done
     assert "Traceback" not in done.err, done
-    usage = [line for line in lines if line.startswith(("usage:", " "))]
-    assert len(lines) - len(usage) == 1, done.err
-    return lines[-1].partition(": ")[2]
+    (line,) = lines
+    return line.partition(": ")[2]
 
 
 def written(path: Path, text: str | bytes) -> Path:

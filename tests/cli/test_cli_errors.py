@@ -67,6 +67,24 @@ def test_removed_options_are_not_in_use_again() -> None:
         assert advice.endswith("."), option
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("monitor gateway.toml", "is a configuration, not a recording. Give it with -c gateway"),
+        ("monitor my.dbc", "is a DBC, not a recording. Give it with --dbc my.dbc."),
+    ],
+)
+def test_a_file_that_needs_an_option_names_the_option(words: str, said: str) -> None:
+    assert said in refused(2, *words.split())
+
+
+def test_status_takes_a_configuration_as_run_check_and_doctor_do(tmp_path: Path) -> None:
+    file = configuration(tmp_path, tmp_path / "port")
+    named = refused(3, "status", file)
+    assert named == refused(3, "status", "-c", file)
+    assert "no gateway runs with this configuration" in named
+
+
 # --- ports
 
 
@@ -273,7 +291,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     ],
 )
 def test_a_time_that_is_too_long_is_refused(words: str, said: str) -> None:
-    assert refused(2, *words.split()).endswith(said)
+    assert f": {said}. Help: " in refused(2, *words.split())
 
 
 def test_an_export_that_cannot_be_written_has_a_remedy(tmp_path: Path) -> None:
