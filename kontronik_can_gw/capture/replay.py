@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.capture.format import (
     COUNTERS,
-    VERSION,
     Entry,
     EntryKind,
     read_frame,
@@ -45,9 +44,7 @@ class Replay:
     ``marked``: the gateway's state on the bus is REPLAY instead of RUNNING. ``state``: the counters
     in the header. If the beginning of the run is missing (no START entry), the gateway starts with
     the first ADVANCE entry and adopts the STATE entries of the next seconds (SETTLE_NS). After them
-    the messages equal the live ones. ``version``: the version of the capture's format. A gateway
-    that wrote version 1 did not count a lost port as a loss of telemetry, so its replay does not
-    either.
+    the messages equal the live ones.
     """
 
     def __init__(
@@ -55,7 +52,6 @@ class Replay:
         gateway: Gateway,
         state: Mapping[str, Any] | None = None,
         marked: bool = False,
-        version: int = VERSION,
     ) -> None:
         self.gateway = gateway
         self.lost = 0
@@ -63,7 +59,6 @@ class Replay:
         self.rejected = 0
         """Number of entries that are invalid."""
         self._marked = marked
-        self._counts_lost_ports = version > 1
         self._waiting = TransmitQueue()
         self._taken: list[TimedFrame] = []
         """Frames of the last turn. The next entry shows if they were sent."""
@@ -156,8 +151,6 @@ class Replay:
                 if now >= self._adopt_until:
                     self._adopt_until = None
         elif kind != EntryKind.CLOCK:
-            if kind == EntryKind.PORT_LOST and not self._counts_lost_ports and gateway.escs[esc].up:
-                gateway.escs[esc].losses -= 1  # the call adds one
             _repeat_rare(gateway, entry)
         return []
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.config.kinds import TEXT, KeyKind
+from kontronik_can_gw.config.kinds import TEXT, KeyKind, shown
 from kontronik_can_gw.errors import did_you_mean
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.protocols import PROTOCOLS
@@ -43,10 +43,10 @@ def condition(text: str) -> Condition:
     """Read a condition. Raises ValueError with the mistake."""
     match = _FORM.fullmatch(text)
     if match is None or len(text) > _LONGEST:
-        raise ValueError(f"{text[:_LONGEST]!r} is not a condition such as {_EXAMPLE}")
+        raise ValueError(f"{shown(text)} is not a condition such as {_EXAMPLE}")
     esc, name, sign, rest = match.groups("")
     if sign not in _OPERATORS:
-        raise ValueError(f"{text!r}: {sign} is unknown. Use one of {', '.join(_OPERATORS)}")
+        raise ValueError(f"{shown(text)}: {sign} is unknown. Use one of {', '.join(_OPERATORS)}")
     value = _value(text, name.strip())
     limit = _limit(text, rest, value)
     about = text[match.start(2) :]
@@ -56,15 +56,15 @@ def condition(text: str) -> Condition:
 def _value(text: str, name: str) -> Value:
     value = VALUES_BY_KEY.get(normalize(name))
     if value is None:
-        near = did_you_mean(name, [each.name for each in VALUES_BY_KEY.values()], 0.5)
-        raise ValueError(f"{text!r}: there is no value {name!r}{near and f'.{near}'}")
+        near = did_you_mean(name, [each.name for each in VALUES_BY_KEY.values()])
+        raise ValueError(f"{shown(text)}: there is no value {shown(name)}{near and f'.{near}'}")
     if value.group is Group.GATEWAY:
-        raise ValueError(f"{text!r}: {value.name} is a value of the gateway, not of an ESC")
+        raise ValueError(f"{shown(text)}: {value.name} is a value of the gateway, not of an ESC")
     if value.names:
-        raise ValueError(f"{text!r}: {value.name} is not a number")
+        raise ValueError(f"{shown(text)}: {value.name} is not a number")
     if value.kind is Kind.AGE:
         raise ValueError(
-            f"{text!r}: {value.name} cannot be compared. "
+            f"{shown(text)}: {value.name} cannot be compared. "
             "The loss of telemetry is an event without a condition"
         )
     return value
@@ -74,23 +74,25 @@ def _limit(text: str, rest: str, value: Value) -> float:
     """Return the limit in the unit of the value."""
     match = _NUMBER.fullmatch(rest)
     if match is None:
-        raise ValueError(f"{text!r}: {rest.strip()!r} is not a number")
+        raise ValueError(f"{shown(text)}: {shown(rest.strip())} is not a number")
     number = Fraction(match[1])
     unit = match[2].strip()
     if unit:
         if not value.unit:
-            raise ValueError(f"{text!r}: {value.name} has no unit. Remove {unit!r}")
+            raise ValueError(f"{shown(text)}: {value.name} has no unit. Remove {shown(unit)}")
         factors = conversion(unit, value.unit)
         if factors is None:
             units = ", ".join(texts_like(value.unit)) or value.unit
-            raise ValueError(f"{text!r}: {unit!r} is no unit of {value.name}. Known: {units}")
+            raise ValueError(
+                f"{shown(text)}: {shown(unit)} is no unit of {value.name}. Known: {units}"
+            )
         number = number * factors[0] + factors[1]
     return float(number)
 
 
 def _check_conditions(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list):
-        raise ValueError(f"{value!r} is not a list of conditions such as [{_EXAMPLE}]")
+        raise ValueError(f"{shown(value)} is not a list of conditions such as [{_EXAMPLE}]")
     _check_each(value, lambda text: condition(TEXT.check(text)))
     return tuple(value)
 
@@ -125,12 +127,14 @@ def _check_error(value: Any) -> None:
     names = _error_names()
     if text not in names:
         near = did_you_mean(text, names).replace(" Did", ". Did")
-        raise ValueError(f"{text!r} is neither error, warning or status nor an error bit{near}")
+        raise ValueError(
+            f"{shown(text)} is neither error, warning or status nor an error bit{near}"
+        )
 
 
 def _check_errors(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list):
-        raise ValueError(f'{value!r} is not a list such as ["error", "undervoltage"]')
+        raise ValueError(f'{shown(value)} is not a list such as ["error", "undervoltage"]')
     _check_each(value, _check_error)
     return tuple(value)
 

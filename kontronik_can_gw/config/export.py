@@ -1,12 +1,12 @@
 """Writes a configuration as TOML, and its keys as a JSON Schema."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields
 from fractions import Fraction
 from typing import Any
 
 from kontronik_can_gw.config.keys import REMOVED_KEYS, TABLES, Config, required
+from kontronik_can_gw.config.kinds import toml_of
 
 
 def schema() -> dict[str, Any]:
@@ -71,22 +71,10 @@ def _toml_table(head: str, table: Any) -> list[str]:
     for row in fields(table):
         value = getattr(table, row.name)
         if isinstance(value, Mapping):
-            lines += [f"{row.name}.{_toml(key)} = {_toml(entry)}" for key, entry in value.items()]
+            lines += [
+                f"{row.name}.{toml_of(key)} = {toml_of(entry)}" for key, entry in value.items()
+            ]
         elif value is not None:
-            lines.append(f"{row.name} = {_toml(value)}")
+            lines.append(f"{row.name} = {toml_of(value)}")
     lines.append("")
     return lines
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, Fraction):
-        decimal = repr(float(value))
-        is_exact = Fraction(decimal) == value
-        return decimal if is_exact else f'"{value}"'
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_toml, value))}]"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return repr(value)

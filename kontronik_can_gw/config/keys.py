@@ -65,20 +65,20 @@ class CanConfig:
     interface: str = key(TEXT, "socketcan",
         "interface of python-can: socketcan, virtual, pcan, kvaser, slcan ...")
     channel: str = key(TEXT, "can0", "channel of that interface, for example can0")
-    bitrate: int = key(integer(10_000, 1_000_000), 500_000,
+    bitrate: int = key(integer(10_000, 1_000_000, "bit/s"), 500_000,
         "bit rate in bit/s. "
         "With socketcan the system sets it, and the gateway only computes the bus load from it")
     fd: bool = key(BOOLEAN, False, "allow CAN FD, that is messages of more than 8 bytes")
-    data_bitrate: int = key(integer(10_000, 8_000_000), 2_000_000,
+    data_bitrate: int = key(integer(10_000, 8_000_000, "bit/s"), 2_000_000,
         "bit rate of CAN FD's data phase in bit/s")
-    restart_after_s: float = key(number(0.3, 3600, or_zero=True), 0.0,
+    restart_after_s: float = key(number(0.3, 3600, "s", or_zero=True), 0.0,
         "restart a SocketCAN interface from which no frame has left for this time in seconds, "
         "which discards old frames. It needs the unit kontronik-can-gw-restart@.path. "
         "0 never restarts it")
     options: Mapping[str, str | float] = key(options("can", _OF_CAN), {},
         "more options of the python-can interface, for example host or ttyBaudrate. "
         "SocketCAN has none")
-    quiet_after_s: int = key(integer(0, 604_800), 0,
+    quiet_after_s: int = key(integer(0, 604_800, "s"), 0,
         "seconds without telemetry after which the gateway only answers requests, "
         "until telemetry returns. 0: never")
 
@@ -115,20 +115,20 @@ class RecordConfig:
         "folder for captures, relative to the configuration's folder. "
         "'state' is the folder captures in the service's state folder "
         "(default: only `run --record` records)")
-    part_mb: int = key(integer(1, 4000), 64, "begin a new file at this size in megabytes")
-    part_minutes: int = key(integer(1, 10_000), 60,
+    part_mb: int = key(integer(1, 4000, "MB"), 64, "begin a new file at this size in megabytes")
+    part_minutes: int = key(integer(1, 10_000, "min"), 60,
         "begin a new file after this time in minutes")
-    keep_mb: int = key(integer(0, 10_000_000), 0,
+    keep_mb: int = key(integer(0, 10_000_000, "MB"), 0,
         "remove the oldest captures while the folder's captures exceed this number of megabytes. "
         "0 removes none")
-    min_free_mb: int = key(integer(0, 10_000_000), 100,
+    min_free_mb: int = key(integer(0, 10_000_000, "MB"), 100,
         "pause recording while the file system has less free space, in megabytes")
     on_event: bool = key(BOOLEAN, False,
         "keep the input in memory, and write a capture only around an event: an error bit, "
         "a condition of `when`, a loss of telemetry, or the signal USR1")
-    before_s: int = key(integer(1, 600), 30,
+    before_s: int = key(integer(1, 600, "s"), 30,
         "on_event: seconds before the first event that a capture has")
-    after_s: int = key(integer(1, 3600), 30,
+    after_s: int = key(integer(1, 3600, "s"), 30,
         "on_event: seconds after the last event that a capture has")
     errors: tuple[str, ...] = key(ERRORS, ("error", "warning"),
         "on_event: error bits that are events, by class or by name")
@@ -160,7 +160,7 @@ class MqttConfig:
     gateway: str | None = key(LEVEL, None,
         "name of this gateway in the topics (default: the host name)")
     topic: str = key(TOPIC, "kontronik", "first part of all topics")
-    rate: float = key(number(0.01, 20), 1.0, "state messages per second for each ESC")
+    rate: float = key(number(0.01, 20, "Hz"), 1.0, "state messages per second for each ESC")
     retain: bool = key(BOOLEAN, False, "ask the broker to keep the last state message of each ESC")
     discovery: str | None = key(TOPIC, None,
         "topic prefix of Home Assistant's discovery, usually 'homeassistant' "
@@ -193,7 +193,7 @@ class EscConfig:
         "a number or 'numerator/denominator'")
     cell_count: int = key(integer(0, 255), 0,
         "cells of the battery. 0: the number that the ESC reports")
-    telemetry_timeout_ms: int = key(integer(20, 60_000), 250,
+    telemetry_timeout_ms: int = key(integer(20, 60_000, "ms"), 250,
         "age in milliseconds above which live values are not available")
     node_id: int | None = key(NODE_ID, None,
         "CANopen node-ID of this ESC. "

@@ -1,8 +1,9 @@
 """Kinds of configuration keys: a check, a JSON Schema and a range in words for each."""
 
+import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
 from fractions import Fraction
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from kontronik_can_gw.errors import did_you_mean
 
 _TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
     "boolean": (bool, "true or false"),
-    "integer": (int, "a whole number"),
+    "integer": (int, "an integer"),
     "number": ((int, float), "a number"),
     "string": (str, "a string"),
     "object": (dict, "a table"),
@@ -37,19 +38,60 @@ def key(kind: KeyKind, default: Any, doc: str) -> Any:
     return field(default=default, metadata=metadata)
 
 
-def _check_type(value: Any, name: str) -> Any:
-    """Return the value if it has this JSON type. In Python a bool is an int, in JSON it is not."""
+_LONGEST = 200
+"""Number of characters after which a value in an error is cut."""
+
+
+def toml_of(value: Any) -> str:
+    """Return a value as it is written in TOML."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, Fraction):
+        decimal = repr(float(value))
+        is_exact = Fraction(decimal) == value
+        return decimal if is_exact else f'"{value}"'
+    if isinstance(value, (tuple, list)):
+        return f"[{', '.join(map(toml_of, value))}]"
+    if isinstance(value, Mapping):
+        pairs = [f"{key_of(name)} = {toml_of(entry)}" for name, entry in value.items()]
+        return f"{{ {', '.join(pairs)} }}" if pairs else "{}"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return str(value)
+
+
+def key_of(name: str) -> str:
+    """Return a key as it is written in TOML, in quotes if it needs them."""
+    return name if re.fullmatch("[A-Za-z0-9_-]+", name) else toml_of(name)
+
+
+def shown(value: Any) -> str:
+    """Return a value as TOML for an error, cut after 200 characters."""
+    text = toml_of(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def _check_type(value: Any, name: str, span: str = "") -> Any:
+    """Return the value if it has this JSON type. In Python a bool is an int, in JSON it is not.
+
+    In the error, ``span`` is the accepted range.
+    """
     expected, words = _TYPES[name]
     is_stray_bool = isinstance(value, bool) and expected is not bool
     if is_stray_bool or not isinstance(value, expected):
-        raise ValueError(f"{value!r} is not {words}")
+        text = f"{shown(value)} is not {words}"
+        if span:
+            text += f", {span}"
+        if name == "string" and isinstance(value, (int, float)):
+            text += f'. Write it in quotes: "{toml_of(value)}"'
+        raise ValueError(text)
     return value
 
 
-def _plain(span: str, problem: str = "", **schema: Any) -> KeyKind:
+def _plain(span: str, problem: str = "", limits: str = "", **schema: Any) -> KeyKind:
     """Return the kind that a JSON Schema of one type describes.
 
-    In the error, ``problem`` follows the refused value.
+    In the error, ``problem`` follows a refused value, and ``limits`` the name of the type.
     """
     low = schema.get("minimum", -math.inf)
     high = schema.get("maximum", math.inf)
@@ -58,34 +100,36 @@ def _plain(span: str, problem: str = "", **schema: Any) -> KeyKind:
     longest = schema.get("maxLength", math.inf)
 
     def check(value: Any) -> Any:
-        _check_type(value, schema["type"])
+        _check_type(value, schema["type"], limits)
         if schema["type"] == "string":
             is_valid = len(value) <= longest and re.fullmatch(form, value)
         else:
             is_in_gap = gap["exclusiveMinimum"] < value < gap["exclusiveMaximum"]
             is_valid = low <= value <= high and not is_in_gap
         if not is_valid:
-            raise ValueError(f"{value!r} {problem}")
+            raise ValueError(f"{shown(value)} {problem}")
         return value
 
     return KeyKind(span, schema, check)
 
 
-def integer(low: int, high: int, also: int | None = None) -> KeyKind:
+def integer(low: int, high: int, unit: str = "", also: int | None = None) -> KeyKind:
     """Accept a whole number from ``low`` to ``high``, or the greater number ``also``."""
     schema: dict[str, Any] = {
         "type": "integer",
         "minimum": low,
         "maximum": high,
     }
-    span = f"{low} … {high}"
-    problem = f"is outside {low}..{high}"
+    span = f"{low} … {high} {unit}".rstrip()
+    limits = f"{low} to {high} {unit}".rstrip()
+    problem = f"is outside {limits}"
     if also is not None:
         schema["maximum"] = also
         schema["not"] = {"exclusiveMinimum": high, "exclusiveMaximum": also}
         span = f"{span}, {also}"
-        problem = f"is neither in {low}..{high} nor {also}"
-    return _plain(span, problem, **schema)
+        problem = f"is neither {limits} nor {also}"
+        limits = f"{limits} or {also}"
+    return _plain(span, problem, limits, **schema)
 
 
 def integer_or_list(low: int, high: int, length: int) -> KeyKind:
@@ -97,24 +141,26 @@ def integer_or_list(low: int, high: int, length: int) -> KeyKind:
             number: int = one.check(value)
             return number
         if len(value) != length:
-            raise ValueError(f"{value!r} is not a list of {length} numbers")
+            raise ValueError(f"{shown(value)} is not a list of {length} numbers")
         return tuple(one.check(entry) for entry in value)
 
     numbers = {"type": "array", "items": one.schema, "minItems": length, "maxItems": length}
     return KeyKind(f"{one.span}, or lists of {length}", {"anyOf": [one.schema, numbers]}, check)
 
 
-def number(low: float, high: float, or_zero: bool = False) -> KeyKind:
+def number(low: float, high: float, unit: str = "", or_zero: bool = False) -> KeyKind:
     """Accept a number from ``low`` to ``high``, with ``or_zero`` also 0."""
     schema: dict[str, Any] = {"type": "number", "minimum": low, "maximum": high}
-    span = f"{low} … {high}"
-    problem = f"is outside {low}..{high}"
+    span = f"{low} … {high} {unit}".rstrip()
+    limits = f"{low} to {high} {unit}".rstrip()
+    problem = f"is outside {limits}"
     if or_zero:
         schema["minimum"] = 0
         schema["not"] = {"exclusiveMinimum": 0, "exclusiveMaximum": low}
         span = f"0, {span}"
-        problem = f"{problem} and not 0"
-    return _plain(span, problem, **schema)
+        problem = f"is neither 0 nor {limits}"
+        limits = f"0 or {limits}"
+    return _plain(span, problem, limits, **schema)
 
 
 def pattern(
@@ -127,13 +173,8 @@ def pattern(
 
     In the error, ``problem`` follows the refused text.
     """
-    return _plain(
-        span,
-        problem,
-        type="string",
-        pattern=f"^{form}$",
-        **limits,
-    )
+    schema: dict[str, Any] = {"type": "string", "pattern": f"^{form}$", **limits}
+    return _plain(span, problem, **schema)
 
 
 def choice(*choices: str) -> KeyKind:
@@ -150,8 +191,8 @@ def choice_of(known: Callable[[], Sequence[str]], span: str = "") -> KeyKind:
     def check(value: Any) -> str:
         text = _check_type(value, "string")
         if text not in known():
-            near = did_you_mean(text, known(), 0.5, or_known=True)
-            raise ValueError(f"unknown value {text!r}.{near}")
+            near = did_you_mean(text, known(), or_known=True)
+            raise ValueError(f"unknown value {shown(text)}.{near}")
         return str(text)
 
     span = span or ", ".join(f'"{text}"' for text in known())
@@ -172,7 +213,7 @@ def table_of(kind: KeyKind) -> KeyKind:
             try:
                 checked[name] = kind.check(entry)
             except ValueError as error:
-                raise ValueError(f"{name}: {error}") from None
+                raise ValueError(f"{key_of(name)}: {error}") from None
         return checked
 
     span = f"table of {kind.span}"
@@ -187,7 +228,7 @@ def options(path: str, own: frozenset[str]) -> KeyKind:
 
     def entry(value: Any) -> Any:
         if not isinstance(value, (str, int, float)):
-            raise ValueError(f"{value!r} is not a string, a number or a boolean")
+            raise ValueError(f"{shown(value)} is not a string, a number or a boolean")
         return value
 
     of_entry = {"type": ["string", "number", "boolean"]}
@@ -213,15 +254,17 @@ def _check_ratio(value: Any) -> Fraction:
         numerator, _, denominator = str(value).partition("/")
         ratio = Fraction(numerator) / Fraction(denominator or 1)
     except (ValueError, ZeroDivisionError):
-        raise ValueError(f"{value!r} is neither a number nor 'numerator/denominator'") from None
+        raise ValueError(
+            f'{shown(value)} is neither a number, 0.001 to 1000, nor "numerator/denominator"'
+        ) from None
     if not Fraction(1, 1000) <= ratio <= 1000:
-        raise ValueError(f"{value} is outside 0.001..1000")
+        raise ValueError(f"{shown(value)} is outside 0.001 to 1000")
     return ratio
 
 
 def _check_names(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list):
-        raise ValueError(f'{value!r} is not a list of names such as ["Motor_*"]')
+        raise ValueError(f'{shown(value)} is not a list of names such as ["Motor_*"]')
     return tuple(TEXT.check(name) for name in value)
 
 
@@ -231,7 +274,7 @@ def _check_source(value: Any) -> Any:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if is_number and math.isfinite(value):
         return value
-    raise ValueError(f"{value!r} is neither the name of a source nor a number")
+    raise ValueError(f"{shown(value)} is neither the name of a source nor a number")
 
 
 def _check_bindings(value: Any) -> Any:

@@ -121,10 +121,10 @@ class DronecanConfig:
     first_index: int = key(integer(0, 31), 0,
         "esc_index of the first ESC. The others count up from it. "
         "PX4 and Betaflight use it unchanged, ArduPilot adds CAN_Dn_UC_ESC_OF")
-    rate_hz: int = key(integer(1, 200), 50,
+    rate_hz: int = key(integer(1, 200, "Hz"), 50,
         "esc.Status messages per second for each ESC, while its telemetry is fresh. "
         "ArduPilot needs at least 10")
-    extended_hz: int = key(integer(0, 200), 0,
+    extended_hz: int = key(integer(0, 200, "Hz"), 0,
         "esc.StatusExtended messages (throttle, duty, error bits) per second for each ESC. "
         "0 sends none, because this message cannot mark a value as unknown")
     rpm: str = key(choice("motor", "output", "electrical"), "motor",

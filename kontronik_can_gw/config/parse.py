@@ -21,6 +21,7 @@ from kontronik_can_gw.config.keys import (
     RecordConfig,
     required,
 )
+from kontronik_can_gw.config.kinds import key_of, shown
 from kontronik_can_gw.core.output_setup import OUTPUTS
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.value_names import VALUES_BY_KEY, normalize
@@ -82,8 +83,8 @@ def _make_config(
     removed: list[str] = []
     for name in tables:
         if name not in TABLES:
-            near = did_you_mean(name, TABLES, 0.5, or_known=True)
-            problems.append(f"{name}: unknown table.{near}")
+            near = did_you_mean(name, TABLES, or_known=True)
+            problems.append(f"{key_of(name)}: unknown table.{near}")
     made = {}
     for name in TABLES:
         if name != "esc":
@@ -144,8 +145,8 @@ def _make_table(
         if advice is not None:
             removed.append(f"{place}.{key}: was removed and is ignored. {advice}")
         elif key not in kinds:
-            near = did_you_mean(key, kinds, 0.5, or_known=True)
-            problems.append(f"{place}.{key}: unknown key.{near}")
+            near = did_you_mean(key, kinds, or_known=True)
+            problems.append(f"{place}.{key_of(key)}: unknown key.{near}")
         else:
             try:
                 values[key] = kinds[key].check(value)
@@ -167,17 +168,17 @@ def _esc_problems(escs: Mapping[int, EscConfig]) -> Iterator[str]:
     names = {number: normalize(esc.name) for number, esc in escs.items()}
     ports = {number: esc.port for number, esc in escs.items()}
     for number, other in _duplicates(names):
-        yield f"esc[{number}].name: {escs[number].name!r} is already used by esc[{other}]"
+        yield f"esc[{number}].name: {shown(escs[number].name)} is already used by esc[{other}]"
     for number, other in _duplicates(ports):
-        yield f"esc[{number}].port: {escs[number].port!r} is already used by esc[{other}]"
+        yield f"esc[{number}].port: {shown(escs[number].port)} is already used by esc[{other}]"
     for number, esc in escs.items():
         if esc.device is not None and esc.device_number is None:
-            problem = f"{esc.device!r} is not a device of the protocol {esc.protocol}"
+            problem = f"{shown(esc.device)} is not a device of the protocol {esc.protocol}"
             yield f"esc[{number}].device: {problem}"
     for number, esc in escs.items():
         if _is_ambiguous(names[number], {"", *names.values()}):
             yield (
-                f"esc[{number}].name: {esc.name!r} makes signal names ambiguous. "
+                f"esc[{number}].name: {shown(esc.name)} makes signal names ambiguous. "
                 "Choose another name."
             )
 
@@ -213,6 +214,10 @@ def _without_effect(can: CanConfig, record: RecordConfig) -> Iterator[str]:
             f"can.restart_after_s: has no effect with the interface {can.interface}, because only "
             "SocketCAN interfaces can be restarted"
         )
+    default = RecordConfig()
+    for name in ("before_s", "after_s", "errors", "when"):
+        if not record.on_event and getattr(record, name) != getattr(default, name):
+            yield f"record.{name}: has no effect without record.on_event = true"
     if record.on_event and record.directory is None:
         yield "record.on_event: record.directory is not set, so only `run --record DIR` records"
 
@@ -230,7 +235,7 @@ def _output_problems(config: Config) -> Iterator[str]:
     if path is not None:
         for what, other in files.items():
             if normpath(path) == normpath(other):
-                yield f"statistics.file: {str(path)!r} is {what}, which would be overwritten"
+                yield f"statistics.file: {shown(str(path))} is {what}, which would be overwritten"
     if config.canopen.enabled:
         yield from _node_id_problems(config)
     yield from _condition_problems(config)
@@ -246,7 +251,7 @@ def _condition_problems(config: Config) -> Iterator[str]:
         name = condition(text).esc
         if name and name not in known:
             names = ", ".join(known.values())
-            yield f"record.when: {text!r}: there is no ESC of this name. Known: {names}."
+            yield f"record.when: {shown(text)}: there is no ESC of this name. Known: {names}."
 
 
 def _node_id_problems(config: Config) -> Iterator[str]:

@@ -23,7 +23,7 @@ from kontronik_can_gw.config.conditions import condition
 from kontronik_can_gw.config.export import as_toml, schema
 from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, shipped
 from kontronik_can_gw.config.parse import load, parse
-from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.times import MS
 
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
@@ -67,19 +67,21 @@ def problems(given_tables: Any) -> list[str]:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("batery_voltage < 3", "there is no value 'batery_voltage'. Did you mean battery_voltage?"),
-        ("left.x < 3", "there is no value 'x'"),
+        ("batery_voltage < 3", 'there is no value "batery_voltage". Did you mean battery_voltage?'),
+        ("left.x < 3", 'there is no value "x"'),
         ("battery_voltage = 3", "= is unknown. Use one of <, <=, >, >="),
         ("battery_voltage <> 3", "<> is unknown. Use one of <, <=, >, >="),
-        ("battery_voltage < x", "'x' is not a number"),
-        ("battery_voltage <", "'' is not a number"),
-        ("battery_voltage < 3 A", "'A' is no unit of battery_voltage. Known: V, mV, kV"),
-        ("undervoltage > 0 V", "undervoltage has no unit. Remove 'V'"),
+        ("battery_voltage < x", '"x" is not a number'),
+        ("battery_voltage <", '"" is not a number'),
+        ("battery_voltage < 3 A", '"A" is no unit of battery_voltage. Known: V, mV, kV'),
+        ("undervoltage > 0 V", 'undervoltage has no unit. Remove "V"'),
         ("uptime > 3", "uptime is a value of the gateway, not of an ESC"),
         ("operating_state > 3", "operating_state is not a number"),
         ("data_age > 3", "data_age cannot be compared. The loss of telemetry is an event"),
         ("right.battery_voltage < 3", "there is no ESC of this name. Known: esc1."),
-        ("hello", "'hello' is not a condition such as \"battery_voltage < 20\""),
+        ("hello", '"hello" is not a condition such as "battery_voltage < 20"'),
+        ("voltage < 20", "Did you mean battery_voltage or bec_voltage?"),
+        ("nothing < 20", 'there is no value "nothing"'),
         ("x" * 300 + "<", "is not a condition such as"),
     ],
 )
@@ -93,9 +95,9 @@ def test_all_wrong_conditions_and_error_bits_are_named_at_once() -> None:
     wrong = ["a < 1", "batery_voltage < 1", 3, "battery_voltage < 20"]
     record = {"when": wrong, "errors": ["x", "undervoltag"]}
     when, errors = problems(tables() | {"record": record})
-    assert "there is no value 'a'; 'batery_voltage < 1': " in when
-    assert when.endswith("Did you mean battery_voltage? 3 is not a string")
-    assert "'x' is neither error, warning or status nor an error bit; 'undervoltag'" in errors
+    assert 'there is no value "a"; "batery_voltage < 1": ' in when
+    assert when.endswith('Did you mean battery_voltage? 3 is not a string. Write it in quotes: "3"')
+    assert '"x" is neither error, warning or status nor an error bit; "undervoltag"' in errors
     assert errors.endswith("Did you mean undervoltage?")
 
 
@@ -190,7 +192,7 @@ TWO_ON_ONE_PORT = [{"port": "a"}, {"port": "a"}]
 OTHERS: list[tuple[dict[str, Any], list[str]]] = [
     (
         {"statistics": {"file": "my.dbc"}} | escs({"name": "x"}, {"name": "X"}),
-        ["esc[2].name: 'X' is already used", "statistics.file", BAD_DBC],
+        ['esc[2].name: "X" is already used', "statistics.file", BAD_DBC],
     ),
     (
         {"canopen": {"node_id": 127, "eds": "none.eds"}, "esc": TWO_ON_ONE_PORT},
@@ -403,6 +405,70 @@ def test_schema_and_parser_accept_the_same_and_toml_is_equal() -> None:
                         assert found == value, place
                         assert type(found) is type(value), place
                     check_toml(config)
+
+
+PYTHON = re.compile(r"\b(True|False|None)\b|\{'|\['|'[^' ]*' is |\(\w+,\)")
+"""Values as Python writes them."""
+
+
+def test_no_mistake_of_any_key_has_a_value_as_python_writes_it() -> None:
+    found: set[str] = set()
+    for table, keys in KEYS.items():
+        for key in keys:
+            for _, value in given(table, key):
+                try:
+                    parse(tables(table, key, deepcopy(value)), "a.toml")
+                except UserError as error:
+                    found.update(line for line in error.problems if PYTHON.search(line))
+    assert not found
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value", "said"),
+    [
+        ("can", "bitrate", True, "true is not an integer, 10000 to 1000000 bit/s"),
+        ("can", "bitrate", 9999, "9999 is outside 10000 to 1000000 bit/s"),
+        ("can", "restart_after_s", 0.1, "0.1 is neither 0 nor 0.3 to 3600 s"),
+        ("can", "channel", 7, '7 is not a string. Write it in quotes: "7"'),
+        ("can", "fd", {"b": True}, "{ b = true } is not true or false"),
+        ("canopen", "node_id", "1", '"1" is not an integer, 1 to 127 or 255'),
+        ("record", "before_s", 601, "601 is outside 1 to 600 s"),
+        ("mqtt", "rate", [1], "[1] is not a number, 0.01 to 20 Hz"),
+        ("esc", "gear", "1/2/3", '"1/2/3" is neither a number, 0.001 to 1000, nor "numerator'),
+    ],
+)
+def test_a_refused_value_is_shown_as_toml_with_range_and_unit(
+    table: str, key: str, value: Any, said: str
+) -> None:
+    (line,) = problems(tables(table, key, value))
+    assert said in line
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("before_s", 3), ("after_s", 3), ("when", ["battery_voltage < 20"])]
+)
+def test_a_key_of_events_without_on_event_has_a_warning(key: str, value: Any) -> None:
+    (line,) = parse(tables("record", key, value), "a.toml").warnings
+    assert line == f"a.toml: record.{key}: has no effect without record.on_event = true"
+    on = tables() | {"record": {key: value, "on_event": True, "directory": "d"}}
+    assert parse(on, "a.toml").warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "said"),
+    [
+        ("voltage", ["overvoltage", "battery_voltage"], " Did you mean battery_voltage?"),
+        ("temp", ["timing", "bec_temperature"], " Did you mean bec_temperature?"),
+        ("BatteryVoltage", ["battery_voltage"], " Did you mean battery_voltage?"),
+        ("batery_voltage", ["voltage", "battery_voltage"], " Did you mean battery_voltage?"),
+        ("nothing", ["timing"], ""),
+        ("canbus", ["can", "dbc"], " Did you mean can?"),
+        ("x", ["y"], ""),
+        ("", ["y"], ""),
+    ],
+)
+def test_suggestions_rank_whole_words_first(name: str, known: list[str], said: str) -> None:
+    assert did_you_mean(name, known) == said
 
 
 def test_schema_and_parser_accept_the_same_kinds_of_tables() -> None:

@@ -139,7 +139,7 @@ class CaptureInput(PlayedInput):
     def _play(
         self, gateway: "Gateway", player: "Player | None" = None
     ) -> "Iterator[list[TimedFrame] | Frames]":
-        replay = Replay(gateway, self.header.get("state"), self.marked, self.setup.version)
+        replay = Replay(gateway, self.header.get("state"), self.marked)
         for frames in self._steps(replay, player):
             if player is not None:
                 sent = player.take_frames()

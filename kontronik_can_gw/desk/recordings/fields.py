@@ -5,11 +5,10 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from enum import Enum
 from typing import Any
 
-from kontronik_can_gw.errors import UserError
+from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Divisor, Group, physical, steps, values_of_esc
 from kontronik_can_gw.esc.values import Value as EscValue
@@ -213,10 +212,8 @@ class Choice:
                 if any(fnmatch.filter(possible, form) for form in forms)
             ]
             if not found:
-                shown = {_plain(one.name): one.name for one in reversed(fields)}
-                close = get_close_matches(wanted, shown, 1, 0.5)
-                more = f" Did you mean {shown[close[0]]}?" if close else ""
-                problems.append(f"--signals {name}: no such signal.{more}")
+                near = did_you_mean(name, [one.name for one in fields])
+                problems.append(f"--signals {name}: no such signal.{near}")
             chosen |= dict.fromkeys(found)
         if problems:
             raise UserError(*problems)
