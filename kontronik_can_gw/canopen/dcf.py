@@ -1,4 +1,4 @@
-"""Texts made from an EDS: an EDS without some objects, and the DCF of a node (CiA 306, 5)."""
+"""Texts made from an EDS: one with few changes, and the DCF of a node (CiA 306, 5)."""
 
 import re
 from collections.abc import Container, Mapping
@@ -21,6 +21,8 @@ from kontronik_can_gw.canopen.eds import (
 from kontronik_can_gw.errors import UserError
 
 _LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
+_NO_VENDOR = " (no CiA vendor-ID)"
+"""End of the VendorName in the shipped EDS."""
 _OF_OBJECT = re.compile(r"([0-9a-f]{4})(sub[0-9a-f]+|denotation|objectlinks)?$", re.IGNORECASE)
 
 
@@ -36,6 +38,19 @@ def without(eds_data: bytes, indices: Container[int]) -> bytes:
             _remove_from_list(sections[name], indices)
     text = text_of(sections)
     return text.encode("ascii", "replace")
+
+
+def with_vendor_id(eds_data: bytes, vendor_id: int) -> bytes:
+    """Return the EDS with this vendor-ID in [DeviceInfo] and as the default of 1018h:1."""
+    sections = read_sections(eds_data, [])
+    text = f"0x{vendor_id:08X}"
+    for name, key in (("deviceinfo", "VendorNumber"), ("1018sub1", "DefaultValue")):
+        if name in sections:
+            sections[name].set(key, text)
+    device = sections.get("deviceinfo")
+    if device is not None:
+        device.set("VendorName", device.get("VendorName").removesuffix(_NO_VENDOR))
+    return text_of(sections).encode("ascii", "replace")
 
 
 def _remove_from_list(section: Section, indices: Container[int]) -> None:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds
 from kontronik_can_gw.canopen.cob_ids import Use
-from kontronik_can_gw.canopen.dcf import without
+from kontronik_can_gw.canopen.dcf import with_vendor_id, without
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
@@ -303,6 +303,8 @@ def _read_eds(config: Config, machine: Machine) -> Eds:
     reference = _reference(eds, path, machine)
     if not config.canopen.cia402_mirrors:
         eds = eds_of(without(data, _MIRRORS), str(path))
+    if config.canopen.vendor_id is not None:
+        eds = eds_of(with_vendor_id(eds.data, config.canopen.vendor_id), str(path))
     node_ids = [node_id for node_id in config.node_ids if node_id != UNCONFIGURED]
     check_eds(eds, reference, config.escs, node_ids)
     return eds

@@ -10,6 +10,7 @@ from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.conformance.bench import slave_on_bus
 from kontronik_can_gw.desk.conformance.items import Item
 from kontronik_can_gw.desk.conformance.run import (
+    GATEWAY_DEVIATIONS,
     Result,
     Verdict,
     all_items,
@@ -31,7 +32,11 @@ OPTIONS = (
     option("--interface NAME", "python-can interface (default socketcan)", default="socketcan"),
     option("--channel NAME", "channel of the interface (default vcan0)", default="vcan0"),
     option("--only WORD", "only items with this word in their names", action="append", default=[]),
-    option("--deviations FILE", "TOML file with the reasons of deliberate deviations"),
+    option(
+        "--deviations FILE",
+        "TOML file with the reasons of deliberate deviations "
+        "(default without --eds: those of the gateway's nodes)",
+    ),
     option("-o --output FILE", "write the results as Markdown tables"),
     option("--junit FILE", "write the results as JUnit XML"),
     FORCE,
@@ -76,7 +81,8 @@ def main(args: argparse.Namespace) -> int:
     if not 1 <= args.node <= 127:
         raise UserError(f"--node {args.node}: a node-ID is a number from 1 to 127")
     items = chosen_items(args.only)
-    deviations = read_deviations(None if args.deviations is None else Path(args.deviations))
+    reasons = args.deviations or (None if args.eds else GATEWAY_DEVIATIONS)
+    deviations = read_deviations(None if reasons is None else Path(reasons))
     eds = Path(args.eds) if args.eds else Path(str(shipped("eds/kontronik_esc.eds")))
     for output in (args.output, args.junit):
         if output is not None:

@@ -32,7 +32,8 @@ OPTIONS = (
     *OUTPUT,
 )
 EPILOG = (
-    "Prints an unchanged copy of the EDS in use, or a DCF as defined in CiA 306. "
+    "Prints a copy of the EDS in use, or a DCF as defined in CiA 306. The EDS is unchanged, unless "
+    "canopen.vendor_id or canopen.cia402_mirrors changes it. "
     "Exit codes: 0 done; 1 the file cannot be written; 2 wrong usage, configuration or EDS."
 )
 _STATES_AND_COMMANDS = frozenset(

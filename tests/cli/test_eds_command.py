@@ -9,9 +9,11 @@ import canopen
 import pytest
 from command_line import run, written
 
+from kontronik_can_gw.assembly.assemble import load_configuration
 from kontronik_can_gw.canopen.dcf import without
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.setup import shipped_canopen
+from kontronik_can_gw.cli.common import canopen_of
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.esc.telemetry import EscSettings
 
@@ -113,3 +115,24 @@ def test_the_node_answers_with_the_values_of_the_dcf() -> None:
         text = value.decode() if isinstance(value, bytes) else value
         data = dictionary.get_variable(index, sub).encode_raw(text)
         assert data == node.dictionary.upload(index, sub, 0), f"{index:04X}h:{sub:02X}"
+
+
+def test_eds_dcf_and_node_have_the_configured_vendor_id(tmp_path: Path) -> None:
+    (tmp_path / "mine.eds").write_bytes(EDS.read_bytes())
+    file = configuration(tmp_path, "vendor_id = 0x319")
+    code, eds, _ = command("-c", file)
+    assert code == 0
+    _, dcf, _ = command("-c", file, "--node-id", 1)
+    for text in (eds, dcf):
+        assert "VendorNumber=0x00000319" in text
+        path = written(tmp_path / "read.eds", text)
+        read: Any = canopen.import_od(str(path))
+        assert read[0x1018][1].default == 0x319
+        assert read.device_information.vendor_number == 0x319
+        assert "no CiA vendor-ID" not in read.device_information.vendor_name
+    assert "ParameterValue=0x00000319" in dcf
+    loaded = load_configuration(file)
+    (node,) = canopen_of(loaded).nodes(loaded.escs).nodes
+    variable = node.dictionary.get(0x1018, 1)
+    assert variable is not None
+    assert node.dictionary.value(variable, 0) == 0x319

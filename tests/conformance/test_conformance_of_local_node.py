@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import can
@@ -102,6 +103,26 @@ def test_a_deviation_with_a_reason_is_not_a_failure(tmp_path: Path) -> None:
         code, verdicts, messages = conformance("deviation", *words, "--deviations", deviations)
     assert (code, [*verdicts.values()]) == (0, ["deviates"])
     assert "1 items: 0 passed, 0 failed, 1 deviates" in messages
+
+
+def test_reasons_of_the_gateway_apply_only_to_its_own_eds(tmp_path: Path) -> None:
+    words = ("--only", "od-vendor-id-is-assigned")
+    eds = tmp_path / "mine.eds"
+    eds.write_bytes(Path(EDS).read_bytes())
+    with local_node("reasons", 1):
+        code, verdicts, _ = conformance("reasons", *words)
+        assert (code, [*verdicts.values()]) == (0, ["deviates"])
+        code, verdicts, _ = conformance("reasons", *words, "--eds", eds)
+        assert (code, [*verdicts.values()]) == (1, ["failed"])
+
+
+def test_a_slave_that_stores_nothing_is_no_failure(tmp_path: Path) -> None:
+    words = ("--only", "store-capability", "--only", "store-and-restore")
+    with local_node("no_store", 1) as node:
+        dictionary: Any = node.object_dictionary
+        dictionary[0x1010][1].default = 0
+        _, verdicts, _ = conformance("no_store", *words)
+    assert set(verdicts.values()) == {"not supported"}
 
 
 @pytest.mark.parametrize(

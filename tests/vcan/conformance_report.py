@@ -18,7 +18,6 @@ from feeder import Feeder, Identity  # noqa: E402
 from harness import PtyPort  # noqa: E402
 from vcan_tools import PROGRAM, GatewayProcess, canopen_table, configuration, ip  # noqa: E402
 
-DEVIATIONS = PROJECT / "tests" / "conformance" / "gateway_deviations.toml"
 PAGE = PROJECT / "docs" / "reference" / "conformance.md"
 
 
@@ -44,7 +43,7 @@ def gateway_with_a_node(interface: str, folder: Path) -> Iterator[None]:
 
 def conformance(interface: str, *words: object) -> subprocess.CompletedProcess[str]:
     """Run the conformance test of node 1."""
-    command = [*PROGRAM, "conformance", "--channel", interface, "--deviations", str(DEVIATIONS)]
+    command = [*PROGRAM, "conformance", "--channel", interface]
     command += [str(word) for word in words]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 

@@ -64,6 +64,10 @@ class Result(NamedTuple):
     seconds: float
 
 
+GATEWAY_DEVIATIONS = Path(__file__).with_name("gateway_deviations.toml")
+"""Deliberate deviations of the gateway's nodes."""
+
+
 def read_deviations(path: Path | None) -> dict[str, str]:
     """Return the reasons of deliberate deviations by the name of the item.
 

@@ -18,10 +18,18 @@ def _require_object(slave: Slave, index: int) -> None:
         raise Skipped(f"the EDS does not have {index:04X}h")
 
 
-@item("CiA 301, 1010h", "upload of 1010h:1", "bit 0 or bit 1: how the slave stores")
-def store_capability(slave: Slave) -> str:
+def _require_store(slave: Slave) -> int:
+    """Return 1010h:1. Skips the item if the slave states that it does not store."""
     _require_object(slave, _STORE)
     value = slave.number(_STORE, 1)
+    if value == 0:
+        raise Skipped("1010h:1 is 0: the slave stores nothing, for example on a read-only disk")
+    return value
+
+
+@item("CiA 301, 1010h", "upload of 1010h:1", "bit 0 or bit 1: how the slave stores")
+def store_capability(slave: Slave) -> str:
+    value = _require_store(slave)
     require(value & 3 != 0 and value < 4, f"{value:08X}h")
     return f"{value:08X}h"
 
@@ -44,7 +52,7 @@ def restore_wrong_signature(slave: Slave) -> str:
     "777 ms after save, the default after load",
 )
 def store_and_restore(slave: Slave) -> str:
-    _require_object(slave, _STORE)
+    _require_store(slave)
     _require_object(slave, _RESTORE)
     require_heartbeat(slave)
     variable = slave.variable(HEARTBEAT_TIME)
