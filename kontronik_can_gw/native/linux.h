@@ -14,7 +14,7 @@ enum {
     KCG_AT_ONCE = 64,   /* Ports served in one turn; frames given to the kernel in one call. */
     KCG_SETTINGS = 64   /* Bytes of a copy of struct termios. */
 };
-/* Kinds of entries (capture/format.py, Kind). */
+/* Kinds of entries (capture/format.py, EntryKind). */
 enum {
     KCG_NOTE_BYTES = 1,
     KCG_NOTE_ADVANCE = 3
@@ -23,7 +23,7 @@ enum {
 #define KCG_OUTPUTS (1 << 29)          /* An event: let time pass for the outputs. */
 #define KCG_DRAINED (INT64_C(1) << 62) /* As NEVER in times.py. */
 
-/* The port of an ESC (twin: poller.PortInput, which describes the fields of the same name). */
+/* The port of an ESC. PortInput in runtime/port_input.py describes the fields of the same name. */
 typedef struct {
     /* empty_ns: the loop opened and emptied the port at this time. C only reads it.
        asked_ns: the last time at which C knows that the port was empty. A run begins with empty_ns

@@ -48,7 +48,7 @@ struct esc {
     int8_t throttle, temperature, bec_temperature;
     uint8_t opening, state, timing;
     uint8_t frame[48];
-    int length, place;
+    int length;
     int64_t due, next_info;
     _Atomic int64_t sent;
     int64_t next[FIVE], lost[FIVE], matched[FIVE];
@@ -183,8 +183,8 @@ static void write_all(struct esc *e, const uint8_t *data, int length)
     }
 }
 
-/* Begin the frame that is due, or write its next byte. */
-static void step(struct esc *e)
+/* Write the whole frame that is due. */
+static void write_frame(struct esc *e)
 {
     int info = e->due >= e->next_info;
     if (info) { /* an info frame is sent directly before a frame of live data */
@@ -390,7 +390,7 @@ static void feed(double seconds, double warmup)
             break;
         }
         sleep_until(e->due);
-        step(e);
+        write_frame(e);
     }
     measuring = 0;
 }
