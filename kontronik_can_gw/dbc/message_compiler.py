@@ -108,9 +108,15 @@ def _too_many_pages(message: "Message", count: int) -> str | None:
     """Return the problem of a message whose multiplexing is not supported. None if it is."""
     multiplexers = [signal for signal in message.signals if signal.is_multiplexer]
     if len(multiplexers) > 1 or any(signal.multiplexer_ids for signal in multiplexers):
-        return "has more than one level of multiplexing. Only one is supported."
+        return (
+            "has more than one level of multiplexing. Only one is supported. "
+            "Leave the message out (dbc.messages)."
+        )
     if count > _MAX_PAGES:
-        return f"has {count} multiplexer values. At most {_MAX_PAGES} are supported."
+        return (
+            f"has {count} multiplexer values. At most {_MAX_PAGES} are supported. "
+            "Leave the message out (dbc.messages)."
+        )
     return None
 
 
@@ -150,7 +156,10 @@ def _page_problems(
             largest = -1 if multiplexer.is_float else raw_range(multiplexer)[1]
             for page in pages:
                 if page > largest:
-                    problem = f"cannot represent the multiplexer value {page} (m{page})."
+                    problem = (
+                        f"cannot represent the multiplexer value {page} (m{page}), at most "
+                        f"{largest}. Make it longer, or change the value."
+                    )
                     yield f"{where}.{multiplexer.name}: {problem}"
     for signal in signals:
         if signal.page is not None and signal.role in (Role.ALIVE, Role.CRC):
@@ -221,7 +230,9 @@ def _time(
         if found < 0:
             raise ValueError
     except (ValueError, OverflowError, ZeroDivisionError):
-        job.problems.append(f"{where}: {name} is {str(value)[:40]!r}, which is not a time in ms.")
+        job.problems.append(
+            f"{where}: {name} is {str(value)[:40]!r}, which is not a time in ms. Correct it."
+        )
         return 0
     if 0 < found < MS:
         job.warnings.append(f"{where}: {name} is {value} ms. The shortest time is used, 1 ms.")

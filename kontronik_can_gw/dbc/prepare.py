@@ -166,7 +166,8 @@ def _unused_settings(
     yield from _unmet("send_type", settings.send_type, job.send_types, condition, file)
     names = {copy.name for copy in ours}
     for name in sorted(set(settings.e2e_data_ids) - names):
-        yield f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}."
+        near = did_you_mean(name, names)
+        yield f"dbc.e2e_data_ids.{name}: no such message of {node} in {file}.{near}"
     for name in sorted(set(settings.e2e) - job.protected):
         near = did_you_mean(name, [copy.name for copy in ours])
         yield f"dbc.e2e.{name}: no message of {node} in {file} with this name has a CRC.{near}"

@@ -147,9 +147,7 @@ def parse_database(
             sort_signals=None,
         )
     except Exception as error:  # cantools raises errors of many types for other text than a DBC
-        words = str(error)[:_MAX_REASON].split()
-        reason = " ".join(words) or type(error).__name__
-        raise UserError(f"{path}: cannot be read as a DBC: {reason}") from None
+        raise UserError(f"{path}: {_reason(error)}") from None
     if not isinstance(database, cantools.database.Database):
         raise UserError(f"{path}: is not a CAN database")
     if not database.messages and not rewriting.left_out:
@@ -163,6 +161,22 @@ def parse_database(
             warnings.append(f"{path}: left out messages that cannot be sent: {listed(texts)}")
         warnings += (f"{path}: {text}" for text in _equal_messages(database))
     return database
+
+
+_SYNTAX = re.compile(r'(?:DBC: ")?Invalid syntax at (line \d+, column \d+): "(.*)>>!<<(.*)""?')
+"""An error of cantools. ``>>!<<`` is the place of the mistake in its line."""
+
+
+def _reason(error: Exception) -> str:
+    """Return the reason of an error of cantools, in one line."""
+    text = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
+    found = _SYNTAX.match(text)
+    if found is None:
+        return f"cannot be read as a DBC: {text.removeprefix('DBC: ')}"
+    where, before, after = found.groups()
+    at = f"after {before.strip()!r}" if before.strip() else "at the beginning of the line"
+    unknown = after.split('"')[0].strip() or "the end of the line"
+    return f"{where}: is not as in a DBC {at}: {unknown}. Correct it."
 
 
 def _refuse_other_formats(text: str, path: str) -> None:

@@ -105,7 +105,7 @@ class SignalCompiler:
         if outside:
             raise UnfitSignal(
                 f"cannot represent {', '.join(outside)} of its value table. "
-                f"Its raw values are {low} to {high}."
+                f"Its raw values are {low} to {high}. Correct the number, or remove the text."
             )
 
     def _scale(self) -> tuple[Fraction, Fraction, tuple[Fraction, Fraction] | None]:
@@ -115,7 +115,7 @@ class SignalCompiler:
         """
         signal = self.signal
         if signal.scale == 0:
-            raise UnfitSignal("has factor 0.")
+            raise UnfitSignal("has factor 0, so all values would be equal. Correct it.")
         try:
             factor = exact(signal.scale)
             offset = exact(signal.offset)
@@ -126,10 +126,12 @@ class SignalCompiler:
                 float(limit)
         except ValueError:
             raise UnfitSignal(
-                "has a factor, offset or limit that is not a finite number."
+                "has a factor, offset or limit that is not a finite number. Correct it."
             ) from None
         except OverflowError:
-            raise UnfitSignal("has a factor, offset or limit that is too large.") from None
+            raise UnfitSignal(
+                "has a factor, offset or limit that is too large. Correct it."
+            ) from None
         return factor, offset, limits
 
     def _without_source(self, page: int | None) -> SignalPlan:
@@ -216,7 +218,12 @@ class SignalCompiler:
         if isinstance(bound, (int, float)):
             constant = raw_values.constant(self.signal, bound, plan.factor, plan.offset)
             if constant is None:
-                raise UnfitSignal(f"cannot represent its constant {bound} exactly.")
+                raise UnfitSignal(
+                    f"cannot represent its constant {bound} exactly. Its values are "
+                    f"{raw_values.text(plan.low * plan.factor + plan.offset)} to "
+                    f"{raw_values.text(plan.high * plan.factor + plan.offset)} in steps of "
+                    f"{raw_values.text(abs(plan.factor))}. Bind it to one of them."
+                )
             return replace(plan, constant=constant)
         name = self.signal.name if bound is None else bound
         role = None
@@ -368,7 +375,8 @@ def _bound_plan(
         counts = slope == 1 and intercept == 0 and low == 0 and high >= 1
         if plan.is_float or not counts:
             raise UnfitSignal(
-                f"{value.name} is a counter, which needs factor 1, offset 0 and a minimum of 0."
+                f"{value.name} is a counter, which needs factor 1, offset 0 and a minimum of 0. "
+                "Correct them."
             )
         notes.append(f"restarts at 0 after {high}")
     elif not plan.is_float and not numbers:
