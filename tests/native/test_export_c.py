@@ -1,5 +1,6 @@
 """The files of `export c` compile alone without a warning, and send the Python core's frames."""
 
+import ctypes
 import re
 import subprocess
 from collections.abc import Callable
@@ -141,7 +142,8 @@ def test_an_export_links_with_a_cpp_program(
 ) -> None:
     case = shipped_case
     (case.folder / "main.cpp").write_text(_FROM_CPP)
-    case.output(c_compiler("gcc"), "-std=c99", "-c", "core.c", "tables.c")
+    for source in ("core.c", "tables.c"):
+        case.output(c_compiler("gcc"), "-std=c99", "-c", source)
     case.output(
         c_compiler("g++"),
         "-Wall",
@@ -173,7 +175,7 @@ def test_files_that_differ_in_a_structure_do_not_link(
     )
     assert done.returncode != 0
     for name in ("kcg_init", "kcg_take"):
-        expected = rf"undefined reference to .{name}_with_KCG_DATA_8_KCG_FOUND_2"
+        expected = rf"undefined (reference to|symbol:) .?{name}_with_KCG_DATA_8_KCG_FOUND_2"
         assert re.search(expected, done.stderr)
     case.output(
         *words[:2],
@@ -201,9 +203,11 @@ def test_every_declared_function_is_defined(
     gcc = c_compiler("gcc")
     header = case.output(gcc, "-std=c99", option, "-E", "-P", "core.h")
     declared = set(re.findall(r"(kcg_\w+)\([^;{}]*\);", header))
-    case.output(gcc, "-std=c99", option, "-c", "core.c")
-    defined = set(re.findall(r" T (\w+)", case.output("nm", "core.o")))
-    assert declared == defined
+    # The warning is for a function that is defined and not declared.
+    strict = ["-std=c99", option, "-Wmissing-prototypes", "-Werror", "-shared", "-fPIC"]
+    case.output(gcc, *strict, "-o", "core.so", "core.c", "tables.c")
+    defined = ctypes.CDLL(str(case.folder / "core.so"))
+    assert [name for name in declared if not hasattr(defined, name)] == []
     assert sum("slot" in name for name in declared) == count
 
 

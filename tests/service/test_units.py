@@ -79,6 +79,7 @@ def analyze(*words: str) -> "subprocess.CompletedProcess[str]":
 # --- by systemd's tools
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("beside", [False, True])
 def test_systemd_finds_no_fault_in_the_units(tmp_path: Path, beside: bool) -> None:
     for unit in units(tmp_path, beside):
@@ -88,6 +89,7 @@ def test_systemd_finds_no_fault_in_the_units(tmp_path: Path, beside: bool) -> No
         assert (done.returncode, ours) == (0, []), done.stderr
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("beside", [False, True])
 def test_the_service_has_a_low_exposure_level(tmp_path: Path, beside: bool) -> None:
     for unit in units(tmp_path, beside):
@@ -97,6 +99,7 @@ def test_the_service_has_a_low_exposure_level(tmp_path: Path, beside: bool) -> N
         assert float(found[1]) <= (1.6 if "web" in unit.name else MAX_EXPOSED)
 
 
+@pytest.mark.extended
 def test_the_restart_of_an_interface_has_a_low_exposure_level(tmp_path: Path) -> None:
     """docs/security.md states the figure."""
     for name in RESTART:
