@@ -126,6 +126,7 @@ def read(recording: Input, chosen: Sequence[int]) -> list[Any]:
 
 def converted(recording: Input, choice: Choice, form: str, path: Path) -> Any:
     """Convert a recording. Return the result of the conversion and the content of its file."""
+    path.unlink(missing_ok=True)  # of the other core
     with Output(path) as out:
         if form in TABLES:
             result = to_table(recording, out, form, choice)
