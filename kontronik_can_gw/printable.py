@@ -6,6 +6,13 @@ Control characters can command a terminal, and others can mislead the reader.
 import json
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun: "1 row", "2 rows"."""
+    if count == 1:
+        return f"{count} {noun}"
+    return f"{count} {noun}s"
+
+
 def printable(text: str, keep: str = "") -> str:
     """Return the text with ``?`` for each unprintable character that is not in ``keep``.
 

@@ -74,6 +74,7 @@ _TYPES = {
     "state": dict,
     "clock": dict,
 }
+_JSON_NAMES = {dict: "table", list: "list"}
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ class CaptureSetup:
                 f"capture version {version} is not supported, only versions up to {VERSION}"
             )
         try:
-            with reading("the header"):
+            with reading("a part"):
                 _check(header)
                 return cls._of(header)
         except (HeaderError, UserError) as error:
@@ -228,8 +229,9 @@ def _check(header: Header) -> None:
     whole_number(header.get("part", 0), 0, 1 << 32)
     for name, part_type in _TYPES.items():
         if not isinstance(header.get(name, part_type()), part_type):
-            raise HeaderError(f"{name} is invalid")
-    has_escs = 1 <= len(header["escs"]) <= _MAX_ESCS
-    if not has_escs or not isinstance(header["configuration"], str):
-        raise HeaderError("escs or configuration is invalid")
+            raise HeaderError(f'"{name}" is not a {_JSON_NAMES[part_type]}')
+    if not 1 <= len(header["escs"]) <= _MAX_ESCS:
+        raise HeaderError(f'"escs" does not have 1 to {_MAX_ESCS} entries')
+    if not isinstance(header["configuration"], str):
+        raise HeaderError('"configuration" is not a text')
     check_state(header.get("state", {}))

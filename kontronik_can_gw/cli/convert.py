@@ -56,11 +56,16 @@ def _names(text: str) -> list[str]:
     return found
 
 
+def _form(text: str) -> str:
+    """Return a format by its name or its suffix. A type for argparse."""
+    return SUFFIXES.get(f".{text}", text)
+
+
 OPTIONS = (
     option("IN", "capture, CAN log or UART bytes, or - for standard input", dest="input"),
     option("OUT", "file to write, or - for standard output", nargs="?"),
     option("-o --output OUT", "another way to give OUT"),
-    option("--to FORMAT", ", ".join(FORMATS), choices=FORMATS),
+    option("--to FORMAT", ", ".join(FORMATS), choices=FORMATS, type=_form),
     FORCE,
     option("-q --quiet", "print no summary"),
     LAYOUT,
@@ -177,8 +182,11 @@ def _report(
             say(f"times are {recording.provenance['times']}", args.command)
     for line in damage:
         say(line, args.command)
-    for note in recording.clock_notes:
-        say(f"{args.input}: {note}", args.command)
+    notes = recording.notes
+    if form == BYTES:  # they have no times
+        notes = [note for note in notes if note not in recording.clock_notes]
+    for note in notes:
+        say(f"{source}: {note}", args.command)
 
 
 def _nothing(args: argparse.Namespace, form: str, recording: Input) -> str:
@@ -217,7 +225,9 @@ def _format(args: argparse.Namespace) -> str:
         )
     suffix = Path(args.output).suffix.lower()
     if suffix == ".mf4":
-        raise UserError(f"{args.output}: {REMOVED_OPTIONS['convert', '--to mf4']}")
+        raise UserError(
+            f"{args.output}: .mf4 may be a table or a log. {REMOVED_OPTIONS['convert', '--to mf4']}"
+        )
     if suffix not in SUFFIXES:
         raise UserError(
             f"{args.output}: unknown suffix. Give --to, or one of these suffixes: "

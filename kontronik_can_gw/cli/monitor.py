@@ -14,7 +14,7 @@ from kontronik_can_gw.cli.source import SOURCE_OPTIONS, recording_of, source_of
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.watch import once, stream, watch
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.printable import printable_json
+from kontronik_can_gw.printable import counted, printable_json
 
 _ONCE_S = 3.0
 OPTIONS = (
@@ -75,7 +75,11 @@ def main(args: argparse.Namespace) -> int:
         if not args.once:
             watch(source, monitor, stop.is_set)
             count = monitor.view.frames
-            say(f"{count} frames of {monitor.file} seen on {source.name}, none sent")
+            seen = f"{counted(count, 'frame')} of {monitor.file}"
+            if recording is None:
+                say(f"{seen} received on {source.name}. The monitor sends nothing.")
+            else:
+                say(f"{seen} read from {source.name}")
             return 0
         document = once(source, monitor, args.timeout or _ONCE_S, stop.is_set)
         if stop.is_set():

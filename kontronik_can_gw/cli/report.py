@@ -93,6 +93,8 @@ def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) 
         raise RunError(*damage, f"{source}: no values {where}")
     recording.begin_ns = flight.origin_ns
     details = {"Frames": recording.left_out, "Clock": "; ".join(recording.clock_notes)}
+    if details["Clock"]:  # it says the same as the state at the start, and more
+        recording.provenance.pop("clock at the start", None)
     page = render(
         flight,
         source=Path(source).name,
@@ -103,6 +105,6 @@ def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) 
     write_output(args.output, page, inputs, force=args.force)
     if recording.left_out:
         damage.append(f"{source}: {recording.left_out}")
-    damage += [f"{source}: {note}" for note in recording.clock_notes]
+    damage += [f"{source}: {note}" for note in recording.notes]
     for line in damage:
         say(line, "report")

@@ -101,6 +101,6 @@ def source_of(
             opened.select_channel(args.channel)
         with closing(Recording(opened, args.speed or 1.0, at_once=at_once)) as played:
             yield played
-        lines = [*opened.damage, *opened.clock_notes, opened.left_out]
+        lines = [*opened.damage, *opened.notes, opened.left_out]
         for line in dict.fromkeys(filter(None, lines)):
             say(f"warning: {line}")

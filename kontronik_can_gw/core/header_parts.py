@@ -36,9 +36,9 @@ def reading(part: str) -> Iterator[None]:
     except (HeaderError, UserError):
         raise
     except KeyError as error:
-        raise HeaderError(f"{part}: {str(error.args[0])[:40]!r} is missing") from None
+        raise HeaderError(f'{part} lacks "{str(error.args[0])[:40]}"') from None
     except _UNUSABLE:
-        raise HeaderError(f"{part} is invalid") from None
+        raise HeaderError(f"{part} has a value of the wrong type or form") from None
 
 
 def whole_number(value: Any, low: int, high: int) -> int:

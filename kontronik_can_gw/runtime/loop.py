@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, cast
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.printable import counted
 from kontronik_can_gw.runtime.can.can_link import CanLink
 from kontronik_can_gw.runtime.files.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
@@ -317,8 +318,8 @@ def totals(gateway: Gateway, now: int) -> str:
     crc_errors = sum(esc.counters.crc_errors for esc in escs)
     losses = sum(esc.losses for esc in escs)
     return (
-        f"after {duration(now - status.started_ns)}: {live} live frames received, "
-        f"{crc_errors} CRC errors, telemetry lost {losses} times; "
-        f"{status.sent_frames} CAN frames sent, {status.dropped_frames} dropped, "
-        f"bus-off {status.bus_off_count} times"
+        f"after {duration(now - status.started_ns)}: {counted(live, 'live frame')} received, "
+        f"{counted(crc_errors, 'CRC error')}, telemetry lost {counted(losses, 'time')}; "
+        f"{counted(status.sent_frames, 'CAN frame')} sent, {status.dropped_frames} dropped, "
+        f"bus-off {counted(status.bus_off_count, 'time')}"
     )

@@ -297,11 +297,11 @@ def test_a_refused_header_is_described_in_words_for_users(header: dict[str, Any]
     [
         (("dbc", "text"), "Größe 5 €", "dbc: the text of the file has '€', but each character"),
         (("canopen", "eds", "text"), "€", "canopen.eds: the text of the file has '€'"),
-        (("canopen", "stored"), ["€"], "canopen.stored is invalid"),
-        (("dbc", "text"), GONE, "dbc: 'text' is missing"),
-        (("escs", 0, "gear"), 5, "escs is invalid"),
-        (("canopen", "nodes", 0, "serial"), GONE, "canopen.nodes: 'serial' is missing"),
-        (("ports",), 7, "ports is invalid"),
+        (("canopen", "stored"), ["€"], "canopen.stored has a value of the wrong type or form"),
+        (("dbc", "text"), GONE, 'dbc lacks "text"'),
+        (("escs", 0, "gear"), 5, "escs has a value of the wrong type or form"),
+        (("canopen", "nodes", 0, "serial"), GONE, 'canopen.nodes lacks "serial"'),
+        (("ports",), 7, '"ports" is not a list. Use another part of the run'),
     ],
 )
 def test_a_refused_header_names_its_part(

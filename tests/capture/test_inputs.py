@@ -183,6 +183,6 @@ def test_missing_blocks_and_a_missing_end_of_a_capture_are_reported(tmp_path: Pa
     assert times == [3 * SECOND, 3 * SECOND, 7 * SECOND]
     place = sum(map(len, blocks[:3]))
     assert damage == [
-        f"a.kcap: 2 blocks before byte {place} are missing",
+        f"a.kcap: 2 blocks lost before byte {place}",
         "a.kcap: was not closed, so up to a second may be missing at its end",
     ]

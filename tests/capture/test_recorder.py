@@ -190,7 +190,7 @@ def test_writing_to_a_failed_disk_is_tried_again(
     assert bed.step(*entries(10, 30), after_s=6) == ""
     assert bed.closed() == (before + entries(10, 30), 15, [True, False])
     if trouble == "broken":
-        recorded(folder, "are damaged")
+        recorded(folder, "damaged bytes left out")
         recorded(folder, "was not closed")
 
 
@@ -212,6 +212,21 @@ def test_a_remark_that_is_not_written_is_repeated(
     kept, lost, _ = bed.closed()
     assert kept == entries(10) + entries(10, 40)
     assert lost == 30
+
+
+def test_a_capture_that_is_being_written_is_not_damaged(tmp_path: Path) -> None:
+    bed = Bed(tmp_path)
+    assert bed.step(*entries(10)) == ""
+    [path] = tmp_path.iterdir()
+    with path.open("ab") as file:
+        file.write(b"KCB1 a block that is not complete yet")
+    with open_input(path) as found:
+        assert isinstance(found, CaptureInput)
+        kept = [entry for entry in found.entries() if entry.kind == EntryKind.BYTES]
+        assert kept == entries(10)
+        assert found.damage == []
+        assert found.notes[0] == f"{path.name}: is still being written, up to here"
+    bed.closed()
 
 
 def test_an_unusable_folder_is_refused_or_waited_for(tmp_path: Path) -> None:
@@ -354,4 +369,4 @@ def test_a_damaged_header_is_replaced_by_its_copy(tmp_path: Path) -> None:
     whole = file.read_bytes()
     for place in (0, 100, 5000):
         file.write_bytes(whole[:place] + bytes((whole[place] ^ 0x10,)) + whole[place + 1 :])
-        assert recorded(tmp_path, "are damaged") == entries(100)
+        assert recorded(tmp_path, "damaged bytes left out") == entries(100)

@@ -1,5 +1,9 @@
 """Messages about files that are not recordings, and about logs with more ESCs than their DBC."""
 
+import bz2
+import gzip
+import lzma
+from collections.abc import Callable
 from pathlib import Path
 
 import asammdf
@@ -23,6 +27,31 @@ def test_frames_missing_in_the_dbc_are_counted_and_a_remedy_is_named(
         left_out = "frames left out that are not in kontronik_esc.dbc (for another DBC give -c"
         assert left_out in said, words
     assert "left out" not in run("convert", log, tmp_path / "o.blf").err, "which holds all of them"
+
+
+@pytest.mark.parametrize(
+    ("compress", "command"),
+    [(gzip.compress, "zcat"), (bz2.compress, "bzcat"), (lzma.compress, "xzcat")],
+)
+def test_a_compressed_log_gets_the_command_that_reads_it(
+    tmp_path: Path, compress: Callable[[bytes], bytes], command: str
+) -> None:
+    log = write_log(tmp_path / "bus.log", flight(layout_of(["a"]), 1))
+    packed = tmp_path / "bus.kcap.packed"
+    packed.write_bytes(compress(log.read_bytes()))
+    for words in (("convert", packed, tmp_path / "o.csv"), ("report", packed, "-o", "o.html")):
+        said = refused(2, *words)
+        assert f"{packed}: is compressed with " in said
+        assert f"{command} {packed} | kontronik-can-gw COMMAND -" in said
+
+
+def test_a_format_may_be_given_by_its_suffix(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "bus.log", flight(layout_of(["a"]), 1))
+    as_suffix = run("convert", log, "-", "--to", "log")
+    assert as_suffix.code == 0
+    assert as_suffix.data == run("convert", log, "-", "--to", "candump").data
+    said = refused(2, "convert", log, tmp_path / "o.mf4")
+    assert "o.mf4: .mf4 may be a table or a log. Type --to parquet (or csv)" in said
 
 
 def test_a_table_in_mf4_is_distinguished_from_a_log(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def test_a_monitor_reports_a_lost_interface_and_recovers(
                 ip("link", *words)
             wait_for(is_shown, "values again")
         assert shown.end() == 0
-        assert shown.lines[-1].endswith(f"seen on {vcan}, none sent")
+        assert shown.lines[-1].endswith(f"received on {vcan}. The monitor sends nothing.")
         assert "Traceback" not in shown.log
     finally:
         shown.kill()

@@ -14,6 +14,7 @@ const COLOURS = 8;
 const DASHES = { solid: [], dashed: [8, 4], dotted: [2, 3] }; // by the style of a border in CSS
 const FONT = "11px system-ui, sans-serif";
 const WIDTHS = [2, 1.2, 0.8]; // of a plot's lines, where colours and dashes tell ESCs apart
+const SAMPLE_WIDTHS = [4, 2, 1]; // of the same lines in the legend, in whole pixels
 
 function make(tag, attributes = {}, ...children) {
   const node = document.createElement(tag);
@@ -202,7 +203,7 @@ function timePlots(data, whole, showNow) {
     });
     const styleAt = (index) => styleOf(spec.series[index - 1]);
     const markers = {
-      width: 2,
+      width: (u, index) => (several ? SAMPLE_WIDTHS[spec.series[index - 1].line] : 3),
       dash: (u, index) => dashes(styleAt(index)),
       stroke: (u, index) => (spec.series[index - 1].drawn ? `var(${colour(styleAt(index))})` : "transparent"),
     };

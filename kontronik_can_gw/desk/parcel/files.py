@@ -95,7 +95,7 @@ def clean_toml(text: str, part: str, cleaner: Cleaner) -> str:
 
 
 def _is_harmless(table: str, key: str, value: str) -> bool:
-    """Return True if the gateway knows a key, or its value cannot be a secret."""
+    """Return True for a key of the configuration, and for a value that cannot be a secret."""
     path = [part.strip(" \t\"'") for part in f"{table}.{key}".strip(".").split(".")]
     rows = () if path[0] not in TABLES else [row.name for row in fields(TABLES[path[0]])]
     if len(path) > 1:

@@ -25,6 +25,7 @@ from kontronik_can_gw.esc.decoder import Counters, Reading
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
+from kontronik_can_gw.printable import counted
 from kontronik_can_gw.status import GatewayState
 from kontronik_can_gw.times import MS
 
@@ -180,8 +181,8 @@ class BytesInput(PlayedInput):
             self.refusal = self._refusal(counters)
         if counters.dropped_bytes:
             self.damage.append(
-                f"{counters.dropped_bytes} bytes outside of frames, "
-                f"{counters.crc_errors} CRC errors"
+                f"{counted(counters.dropped_bytes, 'byte')} outside of frames, "
+                f"{counted(counters.crc_errors, 'CRC error')}"
             )
         if not counters.live:
             self.damage.append(counters.diagnosis() or "no live frame")

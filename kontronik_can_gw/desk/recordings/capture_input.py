@@ -32,7 +32,8 @@ from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, timed
 from kontronik_can_gw.desk.recordings.trusted_times import TrustedTimes
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.printable import printable
+from kontronik_can_gw.printable import counted, printable
+from kontronik_can_gw.runtime.files.disk import is_locked
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
@@ -96,6 +97,8 @@ class CaptureInput(PlayedInput):
         """Number of entries that were left out because of their times."""
         self._place = ""
         """File and position of the block that is being read, for messages."""
+        self._unfinished = ""
+        """The file that a recorder still writes, as a text."""
         self._devices: list[Any] = list(self.header.get("devices") or [])
         self._events: Any = self.header.get("events")
         self._describe()
@@ -109,6 +112,10 @@ class CaptureInput(PlayedInput):
     @property
     def clock_steps(self) -> Sequence[ClockStep]:
         return clock_steps(self._begun[1], self._offsets)
+
+    @property
+    def notes(self) -> list[str]:
+        return [*filter(None, [self._unfinished]), *super().notes]
 
     @property
     def channel(self) -> str:
@@ -202,7 +209,7 @@ class CaptureInput(PlayedInput):
                 if checked is not None:
                     yield checked
         except ValueError as error:
-            self._add_damage(f"{self._place} {error}")
+            self._add_damage(f"{self._place} is left out from its damage on: it {error}")
 
     def _checked(self, entry: Entry) -> Entry | None:
         """Return the entry at a time not before the previous entry. None if its time is impossible.
@@ -293,28 +300,37 @@ class CaptureInput(PlayedInput):
         """
         self._last_ns = 0
         self._impossible = 0
+        self._unfinished = ""
         self.damage = list(self._headerless)
         self._offsets = []
         self.trust.restart()
         for number, path in enumerate(self._paths):
             expected = 0
             is_closed = False
+            damage: Damage | None = None
             for found in self._blocks(path):
+                if damage is not None:
+                    self._add_damage(_of_bytes(path, damage))
+                damage = None
                 if isinstance(found, Damage):
-                    text = f"{found.length} bytes at {found.offset} are damaged"
-                    self._add_damage(f"{path.name}: {text}")
+                    damage = found
                     continue
                 missing = found.number - expected
                 if missing > 0:
-                    text = f"{missing} blocks before byte {found.offset} are missing"
-                    self._add_damage(f"{path.name}: {text}")
+                    lost = f"{counted(missing, 'block')} lost before byte {found.offset}"
+                    self._add_damage(f"{path.name}: {lost}")
                 expected = found.number + 1
                 is_closed = found.kind == b"E"
-                self._place = f"{path.name}: the block at {found.offset}"
+                self._place = f"{path.name}: the block at byte {found.offset}"
                 if found.kind == b"D":
                     yield found.payload
                 elif found.kind in (b"I", b"H"):
                     self._read_json(found, path, number)
+            if not is_closed and is_locked(path):  # a block may be written at this moment
+                self._unfinished = f"{path.name}: is still being written, up to here"
+                continue
+            if damage is not None:
+                self._add_damage(_of_bytes(path, damage))
             if not is_closed:
                 text = "was not closed, so up to a second may be missing at its end"
                 self._add_damage(f"{path.name}: {text}")
@@ -337,7 +353,7 @@ class CaptureInput(PlayedInput):
                 self._events = found.get("events", self._events)
                 self._describe()
         except ValueError as error:
-            self._add_damage(f"{self._place} {error}")
+            self._add_damage(f"{self._place} is left out from its damage on: it {error}")
 
     def _check_part(self, header: Mapping[str, Any], path: Path, part: int) -> None:
         if header.get("run") != self.header.get("run"):
@@ -356,6 +372,11 @@ class CaptureInput(PlayedInput):
         missing = number - int(first) - part
         if missing > 0:
             self.damage.append(f"{path.name}: {missing} earlier parts of the run are not given")
+
+
+def _of_bytes(path: Path, damage: Damage) -> str:
+    damaged = counted(damage.length, "damaged byte")
+    return f"{path.name}: {damaged} left out, from byte {damage.offset} of the file"
 
 
 def _clock_of(header: Mapping[str, Any]) -> tuple[int, int] | None:
@@ -384,9 +405,11 @@ def _events_in_words(events: Any, begin_ns: int) -> str:
 
 def _header_error(path: Path, error: Exception) -> UserError:
     """Return the message for a header that cannot be used because of ``error``."""
-    problems = ["the header cannot be used, because its format is invalid"]
+    problems = ["the header cannot be used: its format is invalid"]
     if isinstance(error, UserError):
         problems = list(error.problems)
     elif isinstance(error, HeaderError):
         problems = [str(error)]
-    return UserError(*(f"{path}: {problem[:400]}" for problem in problems))
+    remedy = "Use another part of the run, or the version that has recorded it."
+    texts = [problem[:400].rstrip(".") for problem in problems]
+    return UserError(*(f"{path}: {text}. {remedy}" for text in texts))

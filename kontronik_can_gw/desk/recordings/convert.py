@@ -13,8 +13,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
-from kontronik_can_gw.desk.recordings.recording import counted
 from kontronik_can_gw.errors import RunError, UserError
+from kontronik_can_gw.printable import counted
 from kontronik_can_gw.runtime.files.disk import is_locked
 
 if TYPE_CHECKING:

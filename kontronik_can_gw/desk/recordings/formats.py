@@ -10,6 +10,14 @@ BYTES = "bytes"
 """The formats that ``log_format`` does not find."""
 UART_MAGIC = b"KOD"
 """The first bytes of every telemetry frame."""
+_COMPRESSED = {
+    b"\x1f\x8b": ("gzip", "zcat"),
+    b"BZh": ("bzip2", "bzcat"),
+    b"\xfd7zXZ": ("xz", "xzcat"),
+    b"(\xb5/\xfd": ("zstd", "zstdcat"),
+    b"PK\x03\x04": ("zip", "unzip -p"),
+}
+"""Name of a compression and the command that undoes it, by the first bytes of a file."""
 
 
 def format_of(
@@ -25,6 +33,12 @@ def format_of(
     """
     if not head.strip():
         raise UserError(f"{name}: is empty")
+    for magic, (kind, command) in _COMPRESSED.items():
+        if head.startswith(magic):
+            raise UserError(
+                f"{name}: is compressed with {kind}. Give its content through a pipe: "
+                f"{command} {name} | kontronik-can-gw COMMAND -"
+            )
     if is_capture or MAGIC in head:
         return CAPTURE
     log = log_format(head)

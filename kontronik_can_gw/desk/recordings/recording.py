@@ -18,6 +18,7 @@ from kontronik_can_gw.desk.recordings.trusted_times import TrustedTimes
 from kontronik_can_gw.desk.words import duration
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.printable import counted
 from kontronik_can_gw.signals.unpacker import SignalReader, Value
 from kontronik_can_gw.times import SECOND
 
@@ -207,6 +208,11 @@ class Input(ABC):
         return notes
 
     @property
+    def notes(self) -> list[str]:
+        """Lines about the recording that are no damage. Complete after the end was read."""
+        return self.clock_notes
+
+    @property
     def without_data(self) -> Mapping[str, int]:
         """Numbers of error frames and remote frames by ``LogFrame.kind``, of the part read."""
         return {}
@@ -308,13 +314,6 @@ class Input(ABC):
         if wall_ns is None:
             return None
         return wall_ns - time_ns
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a number with its noun: "1 row", "2 rows"."""
-    if count == 1:
-        return f"{count} {noun}"
-    return f"{count} {noun}s"
 
 
 def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:

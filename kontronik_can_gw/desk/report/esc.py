@@ -43,6 +43,7 @@ LIVE = (
 """The first of these in the recording shows whether telemetry is present."""
 DEVICE = ("device", "device_raw", "variant", "firmware_main", "firmware_sub")
 _WORD_BITS = 32
+_NO_TELEMETRY = "Check plug and cable, and the power of the ESC. Its values are unknown meanwhile."
 
 Columns = dict[str, Sequence[Any]]
 """Values of the rows of a chunk by source. None: not available."""
@@ -221,7 +222,9 @@ class EscFlight:
             self._events.end(key, now)
             if is_lost:
                 self.gaps += 1
-                event = FlightEvent("link", self._index, now, "No telemetry", "warning")
+                event = FlightEvent(
+                    "link", self._index, now, "No telemetry", "warning", _NO_TELEMETRY
+                )
                 self._events.begin(key, event)
 
     def _name_device(self, now: int, device: Any, raw: Any, variant: Any, *version: Any) -> None:

@@ -112,7 +112,7 @@ class Chunk(NamedTuple):
     entries: int
     """Number of entries, without remarks about losses and the clock."""
     missing: int
-    """Number of lost entries that its remarks mention."""
+    """Sum of the losses that its remarks state."""
 
 
 class Ring:
@@ -225,7 +225,7 @@ class Ring:
 
 
 def _counts(items: Sequence[Item]) -> tuple[int, int]:
-    """Return the number of entries that are no remarks, and the number of losses in remarks."""
+    """Return the number of entries without remarks, and the losses that the remarks state."""
     entries = sum(item[1] not in (EntryKind.LOST, EntryKind.CLOCK) for item in items)
     missing = [read_numbers(item[3])[0] for item in items if item[1] == EntryKind.LOST]
     return entries, sum(missing)

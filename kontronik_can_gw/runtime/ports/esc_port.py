@@ -9,6 +9,7 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.printable import counted
 from kontronik_can_gw.runtime.poller import Poller
 from kontronik_can_gw.runtime.port_input import StuckCheck
 from kontronik_can_gw.runtime.ports.serial_port import (
@@ -325,7 +326,8 @@ class EscLog:
         if conditions.is_on(self._link_condition):
             crc_errors = esc.counters.crc_errors - self._lost_counters[0]
             dropped = esc.counters.dropped_bytes - self._lost_counters[1]
-            losses = f"; {crc_errors} CRC errors, {dropped} bytes dropped meanwhile"
+            dropped_bytes = counted(dropped, "byte")
+            losses = f"; {counted(crc_errors, 'CRC error')}, {dropped_bytes} dropped meanwhile"
             conditions.end(self._link_condition, said, now, losses)
         elif esc.link is LinkState.DEGRADED:
             text = f"{said}: many CRC errors or dropped bytes"

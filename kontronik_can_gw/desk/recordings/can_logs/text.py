@@ -207,7 +207,7 @@ class TextReader(LogReader):
         return checked(item._replace(time_ns=item.time_ns + self._session_ns))
 
     def _is_head(self, line: bytes, is_inside: bool) -> bool:
-        """Return True if a line belongs to a head. ``is_inside``: the line before it does."""
+        """Return True for a line of a head. ``is_inside``: the previous line was one, too."""
         raise NotImplementedError
 
     def _read_head(self, lines: list[bytes]) -> int | None:
