@@ -19,6 +19,7 @@ from kontronik_can_gw.runtime.can.link_commands import (
     set_up,
 )
 
+_NET = "/sys/class/net"
 _CAN_TYPE = "280"
 """ARPHRD_CAN"""
 _FD_MTU = 72
@@ -41,30 +42,19 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
         add=add_virtual(can),
         leave_bus_off=leave_bus_off(can.channel),
     )
-    net = "/sys/class/net"
-    folder = f"{net}/{can.channel}"
     if can.interface != "socketcan":
         findings.add("can.driver", "unseen", interface=can.interface)
         return findings.found
+    folder = f"{_NET}/{can.channel}"
     if machine.text(f"{folder}/type") != _CAN_TYPE:
-        there = []
-        for name in machine.names(net):
-            if machine.text(f"{net}/{name}/type") == _CAN_TYPE:
-                there.append(name)
-        if machine.exists(folder):
-            case = "no_can"
-        elif kind_by_name(can.channel) in VIRTUAL:
-            case = "no_virtual"
-        else:
-            case = "others" if there else "none"
-        findings.add("can.exists", case, there=", ".join(there) or "none")
+        _report_missing(findings, machine, can.channel)
         return findings.found
     link = _link(machine, can.channel)
     kind = link.get("info_kind") or kind_by_name(can.channel)
-    virtual = kind in VIRTUAL
+    is_virtual = kind in VIRTUAL
     findings.values["up"] = set_up(can, kind)
     findings.values["fd"] = enable_fd(can, kind)
-    findings.add("can.exists", "virtual" if virtual else "ok", kind=kind)
+    findings.add("can.exists", "virtual" if is_virtual else "ok", kind=kind)
     flags = int(machine.text(f"{folder}/flags") or "0", 0)
     is_up = bool(flags & 1)
     findings.add("can.up", "ok" if is_up else "down")
@@ -73,19 +63,37 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
         findings.add("can.fd", "off")
     if not link:
         findings.add("can.details", "no_ip")
-    elif not virtual:
+    if is_virtual:
+        return findings.found
+    if link:
         # an slcan interface has no device, and cannot leave bus-off by itself
         has_restart = kind != "can" or machine.exists(f"{folder}/device")
         data = link.get("info_data", {})
-        _controller(findings, can, data, is_up, has_restart)
+        if is_up or _bitrate(data):  # otherwise the command that starts it sets all of it
+            _check_timing(findings, can, data, has_restart)
+        _check_state(findings, data, has_restart)
         driver = machine.target_of(f"{folder}/device/driver").rpartition("/")[2]
         if driver == _CRASHING_DRIVER and data.get("restart_ms", 0):
             findings.add("can.restart", "may_crash", driver=driver, ms=data["restart_ms"])
-    if can.restart_after_s and not virtual:
+    if can.restart_after_s:
         watched = f"multi-user.target.wants/kontronik-can-gw-restart@{can.channel}.path"
         is_enabled = machine.target_of(f"/etc/systemd/system/{watched}")
         findings.add("can.restart_unit", "ok" if is_enabled else "off", rights=RIGHTS)
     return findings.found
+
+
+def _report_missing(findings: Findings, machine: Machine, channel: str) -> None:
+    """Report that no CAN interface has this name, and list the others."""
+    others = []
+    for name in machine.names(_NET):
+        if machine.text(f"{_NET}/{name}/type") == _CAN_TYPE:
+            others.append(name)
+    case = "others" if others else "none"
+    if machine.exists(f"{_NET}/{channel}"):
+        case = "no_can"
+    elif kind_by_name(channel) in VIRTUAL:
+        case = "no_virtual"
+    findings.add("can.exists", case, there=", ".join(others) or "none")
 
 
 def _link(machine: Machine, name: str) -> Mapping[str, Any]:
@@ -98,33 +106,39 @@ def _link(machine: Machine, name: str) -> Mapping[str, Any]:
     return found
 
 
-def _controller(
+def _bitrate(data: Mapping[str, Any]) -> int:
+    """Return the bit rate that the driver shows. 0 if it shows none."""
+    # a driver with fixed rates, for example slcan, shows the bit rate without further timing
+    fixed_bitrate = data.get("bittiming_bitrate", 0)
+    bitrate: int = data.get("bittiming", {}).get("bitrate", fixed_bitrate)
+    return bitrate
+
+
+def _check_timing(
     findings: Findings,
     can: CanConfig,
     data: Mapping[str, Any],
-    is_up: bool,
     has_restart: bool,
 ) -> None:
-    """Report bit rates, recovery from bus-off, state and modes as the driver shows them."""
-    # a driver with fixed rates, for example slcan, shows the bit rate without further timing
-    fixed_bitrate = data.get("bittiming_bitrate", 0)
-    bitrate = data.get("bittiming", {}).get("bitrate", fixed_bitrate)
-    rates = {"bitrate": (can.bitrate, bitrate)}
+    """Report bit rates and recovery from bus-off as the driver shows them."""
+    rates = {"bitrate": (can.bitrate, _bitrate(data))}
     data_bitrate = data.get("data_bittiming", {}).get("bitrate")
     if can.fd and data_bitrate:
         rates["data_bitrate"] = (can.data_bitrate, data_bitrate)
-    if is_up or bitrate:  # otherwise the command that starts it sets all of it
-        for key, (wanted, real) in rates.items():
-            if real == wanted:
-                case = "ok"
-            else:
-                case = "other" if real else "none"
-            findings.add("can.bitrate", case, key=key, wanted=wanted, real=real)
-        ms = data.get("restart_ms", 0)
-        case = "slcan"
-        if has_restart:
-            case = "ok" if ms else "never"
-        findings.add("can.restart", case, ms=ms)
+    for key, (wanted, real) in rates.items():
+        case = "other" if real else "none"
+        if real == wanted:
+            case = "ok"
+        findings.add("can.bitrate", case, key=key, wanted=wanted, real=real)
+    ms = data.get("restart_ms", 0)
+    case = "slcan"
+    if has_restart:
+        case = "ok" if ms else "never"
+    findings.add("can.restart", case, ms=ms)
+
+
+def _check_state(findings: Findings, data: Mapping[str, Any], has_restart: bool) -> None:
+    """Report the controller's state, error counters and modes."""
     state = data.get("state", "STOPPED")
     counters = data.get("berr_counter", {})
     counts = ""
