@@ -158,8 +158,41 @@ def _install(args: argparse.Namespace, root: Path) -> None:
     program = args.executable or _own_program()
     if args.root is None:
         _check_program(program, is_own=args.executable is None)
-    files = dict(planned(program))
     config = f"etc/{NAME}/{args.instance or 'gateway'}.toml"
+    _write_files(root, program, config)
+    problems = _not_ready(root / config)
+    template = f"{NAME}{'@' if args.instance else ''}.service"
+    unit = template.replace("@", f"@{args.instance}")
+    units = []
+    lines = problems
+    if problems:
+        lines.append(
+            f"{unit} was not enabled. After the correction: sudo systemctl enable --now {unit}"
+        )
+    else:
+        units.append(unit)
+        _enable(root, unit, template)
+        lines.append(f"{unit} is enabled. See: systemctl status {unit}")
+        can = load(root / config).can
+        if can.restart_after_s and can.interface == "socketcan":
+            path_unit = f"{_RESTART}@{can.channel}.path"
+            units.append(path_unit)
+            _enable(root, path_unit, f"{_RESTART}@.path")
+            lines.append(f"{path_unit} is enabled, because can.restart_after_s is not 0")
+    if args.root is None:
+        _reload()
+    if args.now and not units:
+        raise RunError(*lines)
+    if args.now and args.root is None:
+        for enabled in units:
+            _call("systemctl", "restart", enabled)
+    for line in lines:
+        say(line)
+
+
+def _write_files(root: Path, program: str, config: str) -> None:
+    """Write units, rules and a missing configuration, and remove files of earlier versions."""
+    files = dict(planned(program))
     if not (root / config).exists():
         files[config] = example()
     for place in files:
@@ -171,33 +204,6 @@ def _install(args: argparse.Namespace, root: Path) -> None:
     for path in _obsolete_files(root):
         path.unlink()
         say(f"{path}: removed")
-    template = f"{NAME}{'@' if args.instance else ''}.service"
-    unit = template.replace("@", f"@{args.instance}")
-    lines = _not_ready(root / config)
-    is_ready = not lines
-    restarted = ""
-    if is_ready:
-        _enable(root, unit, template)
-        lines = [f"{unit} is enabled. See: systemctl status {unit}"]
-        can = load(root / config).can
-        if can.restart_after_s and can.interface == "socketcan":
-            restarted = f"{_RESTART}@{can.channel}.path"
-            _enable(root, restarted, f"{_RESTART}@.path")
-            lines.append(f"{restarted} is enabled, because can.restart_after_s is not 0")
-    else:
-        lines.append(
-            f"{unit} was not enabled. After the correction: sudo systemctl enable --now {unit}"
-        )
-    if args.root is None:
-        _reload()
-    if args.now and not is_ready:
-        raise RunError(*lines)
-    if args.now and args.root is None:
-        _call("systemctl", "restart", unit)
-        if restarted:
-            _call("systemctl", "restart", restarted)
-    for line in lines:
-        say(line)
 
 
 def _enable(root: Path, unit: str, template: str) -> None:
