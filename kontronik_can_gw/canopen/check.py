@@ -84,7 +84,6 @@ def _missing(entries: Mapping[Place, Entry]) -> Iterator[str]:
 def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
     """Yield mistakes in type, access and default of objects that telemetry and services use."""
     known = {(entry.index, entry.sub): entry for entry in shipped.entries}
-    highest = dict(entries.keys())  # the last sub-index of each index
     for (index, sub), entry in entries.items():
         reference = _reference(known, index, sub)
         if reference is not None:
@@ -95,12 +94,14 @@ def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
         first = _SERVER.get((index, sub))
         if first is not None and not (entry.default == first and entry.relative):
             yield entry, f"must be $NODEID+0x{first:X}, the COB-ID of the SDO server."
+    for index, last in dict(entries.keys()).items():  # the last sub-index of each index
         # sub-index 0 of the history and of mappings is a number that changes
         is_count = index == 0x1003 or index in _MAPPINGS
-        last = highest[index]
-        is_wrong = last and entry.default != last
-        if not sub and is_wrong and not is_count:
-            yield entry, f"must be 0x{last:02X}, the highest sub-index."
+        first_entry = entries.get((index, 0))
+        if first_entry is None or is_count or not last:
+            continue
+        if first_entry.default != last:
+            yield first_entry, f"must be 0x{last:02X}, the highest sub-index."
 
 
 def _reference(
@@ -131,13 +132,12 @@ def _unlike(entry: Entry, shipped: Entry) -> Iterator[str]:
     wanted = shipped.data_type
     if index in _FREE:
         return
-    needs_same_type = index < 0x2000 or wanted not in WHOLE
-    is_storage = index >= 0x2000 and (index, entry.sub) not in BINDINGS
-    if needs_same_type and kind != wanted:
-        yield f"must be of type {TYPE_NAMES[wanted]}, 0x{wanted:04X}."
-    elif wanted in WHOLE and kind not in WHOLE:
+    if index < 0x2000 or wanted not in WHOLE:
+        if kind != wanted:
+            yield f"must be of type {TYPE_NAMES[wanted]}, 0x{wanted:04X}."
+    elif kind not in WHOLE:
         yield "must be of a whole-number type."
-    elif wanted in WHOLE and is_storage:
+    elif (index, entry.sub) not in BINDINGS:  # the object stores its value
         bits = TYPE_BITS[wanted] if index != at.SETTINGS else 8
         if kind in SIGNED or TYPE_BITS[kind] < bits:
             yield f"must be of an unsigned type of {bits} bits or more."

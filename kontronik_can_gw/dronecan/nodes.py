@@ -282,29 +282,11 @@ class Dronecan(Output):
             number = can_id >> 8 & number_bits
             if number == wire.ALLOCATION.number and self._allocation.due != NEVER:
                 self._receive_allocation(frame, source, now)
-            return
-        if not can_id & REQUEST or not source:
-            return
-        node = self._by_id.get(can_id >> 8 & NODE)
-        kind = SERVICES.get(can_id >> 16 & 0xFF)
-        if node is None or kind is None:
-            return
-        request = self._assembler.receive(can_id, frame.data, kind.seed, now)
-        if request is None:
-            return
-        if now - self._answers_since >= SECOND:
-            self._answers_since = now
-            self._answers = 0
-        if self._answers >= MAX_ANSWERS:
-            self._unanswered += 1
-            return
-        transfer_id = frame.data[-1] & TRANSFER_ID
-        status = self._status_of(node, now)
-        answer = node.answer(can_id, kind, request, transfer_id, status)
-        if answer:
-            self._answers += 1
-            self._answered += 1
-            self.frames += answer
+        elif can_id & REQUEST and source:
+            node = self._by_id.get(can_id >> 8 & NODE)
+            kind = SERVICES.get(can_id >> 16 & 0xFF)
+            if node is not None and kind is not None:
+                self._receive_request(frame, node, kind, now)
 
     def own_ids(self) -> dict[int, Owner]:
         """Return the ids that have one of our nodes as their source."""
@@ -348,6 +330,27 @@ class Dronecan(Output):
             "node_ids_refused": self._allocation.refused,
         }
 
+    # --- requests
+
+    def _receive_request(self, frame: CanFrame, node: Node, kind: DataType, now: int) -> None:
+        """Answer a request when its last frame has arrived, at most MAX_ANSWERS a second."""
+        request = self._assembler.receive(frame.can_id, frame.data, kind.seed, now)
+        if request is None:
+            return
+        if now - self._answers_since >= SECOND:
+            self._answers_since = now
+            self._answers = 0
+        if self._answers >= MAX_ANSWERS:
+            self._unanswered += 1
+            return
+        transfer_id = frame.data[-1] & TRANSFER_ID
+        status = self._status_of(node, now)
+        answer = node.answer(frame.can_id, kind, request, transfer_id, status)
+        if answer:
+            self._answers += 1
+            self._answered += 1
+            self.frames += answer
+
     # --- messages
 
     def _send_second(self, now: int) -> None:
@@ -356,13 +359,11 @@ class Dronecan(Output):
             report.update(0, now)
         for node in self._by_id.values():
             self._send_node_status(node, now)
-            if self._table.log_messages:
-                self._send_log(node, now)
-
-    def _send_log(self, node: Node, now: int) -> None:
-        for report in node.reports:
-            for message in report.log(now):
-                self.frames += node.message(wire.LOG_MESSAGE, message, queued=True)
+            if not self._table.log_messages:
+                continue
+            for report in node.reports:
+                for message in report.log(now):
+                    self.frames += node.message(wire.LOG_MESSAGE, message, queued=True)
 
     def _log_again(self) -> None:
         for report in self._reports:

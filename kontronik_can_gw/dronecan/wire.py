@@ -150,10 +150,13 @@ class Assembler:
         elif is_late or len(data) < 8 or len(payload) > MAX_PAYLOAD:
             self.errors += 1
         else:
-            if len(self._begun) >= MAX_TRANSFERS:
-                oldest = next(iter(self._begun))
-                del self._begun[oldest]
-                self.errors += 1
             next_tail = tail & TRANSFER_ID | ~tail & TOGGLE
-            self._begun[can_id] = (next_tail, since, payload)
+            self._await_next(can_id, next_tail, since, payload)
         return None
+
+    def _await_next(self, can_id: int, next_tail: int, since: int, payload: bytes) -> None:
+        if len(self._begun) >= MAX_TRANSFERS:
+            oldest = next(iter(self._begun))
+            del self._begun[oldest]
+            self.errors += 1
+        self._begun[can_id] = (next_tail, since, payload)
