@@ -76,22 +76,21 @@ class Member:
             if name not in self.protocol.bits:
                 self.no_flags[name] = at
                 self.of_group[VALUES[name].group].append(at)
-        self._bits: dict[str, dict[ErrorBit, int | None]] = {}
-        """Bits of each error word, with the column of a bit that has a signal, or None."""
-        for word in _WORDS:
-            bits = self.protocol.errors.get(word, ())
-            self._bits[word] = {bit: self.columns.get(bit.text) for bit in bits}
-        self.factors: dict[str, tuple[float, float]] = {}
+        self.factors = self._conversions()
         """Factor and offset of values whose signal has another unit than their source."""
+
+    def _conversions(self) -> dict[str, tuple[float, float]]:
+        factors = {}
         for name, at in self.columns.items():
             unit = VALUES[name].unit
-            sent_unit = view.reader.columns[at].unit or unit
+            sent_unit = self.view.reader.columns[at].unit or unit
             conversion = units.conversion(sent_unit, unit)
             if conversion is None:
                 continue
             factor, offset = conversion
             if factor != 1 or offset != 0:
-                self.factors[name] = float(factor), float(offset)
+                factors[name] = float(factor), float(offset)
+        return factors
 
     def has(self, *sources: str) -> bool:
         """Return True if the DBC has a signal for one of the sources."""
@@ -194,29 +193,32 @@ class Member:
         If the DBC has no other value of the group, only set bits prove that the flags are valid.
         """
         group = _WORDS[word]
-        bits = self._bits[word]
-        whole = self.number(word)
-        flags = {}
-        for bit, at in bits.items():
-            if at is not None:
-                flags[bit] = self.view.values[at]
-        if whole is None and all(value is None for value in flags.values()):
-            return None
+        number = self._bits_of(word)
         has_other_values = bool(self.of_group[group])
-        if has_other_values and not self.is_known(group):
+        if number is None or (has_other_values and not self.is_known(group)):
             return None
-        number = int(whole or 0)
-        found: list[Alarm] = []
-        for bit in bits:
-            if number >> bit & 1 or flags.get(bit) == 1:
-                found.append(bit)
+        names = {int(bit): bit for bit in self.protocol.errors.get(word, ())}
+        named = [bit for bit in names.values() if number >> bit & 1]
+        unnamed = []
         for position in range(32):
-            if number >> position & 1 and position not in bits:
+            if number >> position & 1 and position not in names:
                 meaning = f"bit {position} of {word}, without a name"
-                found.append(Flag(f"bit{position}", Severity.WARNING, meaning))
-        if not found and not has_other_values:
+                unnamed.append(Flag(f"bit{position}", Severity.WARNING, meaning))
+        if not number and not has_other_values:
             return None
-        return found
+        return [*named, *unnamed]
+
+    def _bits_of(self, word: str) -> int | None:
+        """Return an error word, from its signal and the signals of its bits. None without any."""
+        whole = self.number(word)
+        number = int(whole or 0)
+        is_available = whole is not None
+        for bit in self.protocol.errors.get(word, ()):
+            value = self.value(bit.text)
+            is_available = is_available or value is not None
+            if value == 1:
+                number |= 1 << bit
+        return number if is_available else None
 
     def _first(self, *sources: str) -> Value:
         """Return the first value that is available."""
