@@ -138,17 +138,28 @@ def run(
         for esc, terminal in escs:
             if esc.next_ns <= now_ns:
                 _send_frames(esc, terminal, now_ns)
-        # Waits for at least 1 ms, so that frames due within it share a round. 64 ESCs then need no
-        # more rounds than 10.
-        due_ns = min((esc.next_ns for esc, _ in escs), default=now_ns + SECOND)
-        until_ns = min(due_ns, now_ns + SECOND // 10)
-        if end_ns is not None:
-            until_ns = min(until_ns, end_ns)
-        wait_ms = 0.0 if is_last_round else max((until_ns - now_ns) / 1e6, 1)
+        wait_ms = 0.0 if is_last_round else _wait_ms(escs, now_ns, end_ns)
         for fd, _ in poller.poll(wait_ms):
             index = index_of[fd]
             if escs[index][1].check():
                 on_received(index)
+
+
+def _wait_ms(
+    escs: Sequence[tuple[SimulatedEsc, PtyEsc]],
+    now_ns: int,
+    end_ns: int | None,
+) -> float:
+    """Return the time until the next frame is due, at most 100 ms.
+
+    It is at least 1 ms, so that frames due within it share a round. 64 ESCs then need no more
+    rounds than 10.
+    """
+    dues = [esc.next_ns for esc, _ in escs]
+    dues.append(now_ns + SECOND // 10)
+    if end_ns is not None:
+        dues.append(end_ns)
+    return max((min(dues) - now_ns) / 1e6, 1)
 
 
 def _send_frames(esc: SimulatedEsc, terminal: PtyEsc, now_ns: int) -> None:
