@@ -55,10 +55,8 @@ def check_port(
         findings.add("port.exists", case, there=_available(machine))
         return findings.found
     usb = _adapter(machine, machine.real(f"{hardware}/device"))
-    what = tty
-    if usb:
-        product = machine.text(f"{usb}/product")
-        what = ", ".join(filter(None, [tty, product]))
+    product = machine.text(f"{usb}/product") if usb else ""
+    what = ", ".join(filter(None, [tty, product]))
     case = "pty" if is_pty else "ok"
     findings.add("port.exists", case, what=what)
     if diagnosis:
@@ -66,14 +64,16 @@ def check_port(
     case = _permission(machine, port, status)
     group = machine.group_name(status.st_gid)
     findings.add("port.permission", case, group=group)
-    _users(machine, findings, status, is_pty)
+    _check_users(machine, findings, status, is_pty)
     if is_pty:
         return findings.found
-    if usb and port.startswith("/dev/tty"):
-        better = _stable_name(machine, real, usb)
-        case = "unstable" if better else "no_udev"
-        findings.add("port.name", case, better=better)
-    _writers(machine, findings, tty, usb)
+    if usb:
+        if port.startswith("/dev/tty"):
+            better = _stable_name(machine, real, usb)
+            case = "unstable" if better else "no_udev"
+            findings.add("port.name", case, better=better)
+        _check_probing_services(machine, findings)
+    _check_consoles(machine, findings, tty)
     if even_parity and is_mini_uart(f"/dev/{tty}", machine.root):
         findings.add("port.parity", "mini_uart")
     return findings.found
@@ -131,20 +131,19 @@ def _stable_name(machine: Machine, real: str, usb: str) -> str:
     return ""
 
 
-def _users(machine: Machine, findings: Findings, status: os.stat_result, is_pty: bool) -> None:
+def _check_users(
+    machine: Machine,
+    findings: Findings,
+    status: os.stat_result,
+    is_pty: bool,
+) -> None:
     """Report the programs that have the port open.
 
     The simulator has a pseudo terminal open, too. A getty is reported by another check.
     """
-    own = []
-    others = []
-    for process in machine.openers(status):
-        if "getty" in process.name:
-            continue
-        if process.is_gateway:
-            own.append(process)
-        elif not is_pty:
-            others.append(process)
+    users = [process for process in machine.openers(status) if "getty" not in process.name]
+    own = [process for process in users if process.is_gateway]
+    others = [process for process in users if not process.is_gateway and not is_pty]
     for process in own:
         findings.add("port.users", "gateway", who=process)
     if others:
@@ -156,8 +155,8 @@ def _users(machine: Machine, findings: Findings, status: os.stat_result, is_pty:
         findings.add("port.users", "ok" if sees_all else "unseen")
 
 
-def _writers(machine: Machine, findings: Findings, tty: str, usb: str) -> None:
-    """Check that no console of the kernel, no login prompt and no service writes to the ESC."""
+def _check_consoles(machine: Machine, findings: Findings, tty: str) -> None:
+    """Check that no console of the kernel and no login prompt writes to the ESC."""
     consoles = machine.text("/sys/class/tty/console/active").split()
     case = "console" if tty in consoles else "ok"
     findings.add("port.console", case)
@@ -168,8 +167,10 @@ def _writers(machine: Machine, findings: Findings, tty: str, usb: str) -> None:
             prompts.append(str(process))
     case = "getty" if prompts else "ok"
     findings.add("port.getty", case, who=", ".join(prompts))
-    if not usb:
-        return
+
+
+def _check_probing_services(machine: Machine, findings: Findings) -> None:
+    """Check that no service sends bytes to USB adapters to find out what they are."""
     names = {process.name for process in machine.processes}
     places = [f"{top}/{_RULES}" for top in ("/etc", "/usr/lib", "/lib")]
     has_rules = any(map(machine.exists, places))

@@ -52,19 +52,11 @@ def _unit_name(config: str) -> str:
 def check_service(machine: Machine, findings: Findings, unit: Unit | None, config: str) -> None:
     """Check if the service is installed, enabled and running, and how often it was restarted."""
     if unit is None:
-        name = _unit_name(config)
+        units = [f"{folder}/{NAME}.service" for folder in _UNIT_FOLDERS]
+        case = "none"
         if not machine.exists(_BOOTED):
-            is_packaged = any(
-                machine.exists(f"{folder}/{NAME}.service") for folder in _UNIT_FOLDERS
-            )
-            findings.add(
-                "machine.service",
-                "not_booted" if is_packaged else "no_systemd",
-                unit=name,
-                file=config,
-            )
-        else:
-            findings.add("machine.service", "none")
+            case = "not_booted" if any(map(machine.exists, units)) else "no_systemd"
+        findings.add("machine.service", case, unit=_unit_name(config), file=config)
         return
     state = unit.shown.get("ActiveState", "")
     restarts = unit.shown.get("NRestarts", "0")
