@@ -73,7 +73,10 @@ class Emergencies:
         self._open = False
         self._last_ns = -NEVER
         self.is_quiet = False
-        """True if no emergencies are sent. ``repeat`` sends them afterwards."""
+        """True if no emergencies are sent: in quiet mode, or because no frame may leave.
+
+        ``repeat`` sends them afterwards.
+        """
         self._had_error = False
         """True if there was an error since the last reset."""
         self._bind_objects()
@@ -228,14 +231,21 @@ class Emergencies:
         self._node_id = node_id
         self._inhibit_ns = self._dictionary.number(0x1015) * MS // 10
 
-    def repeat(self, now: int) -> None:
-        """Report all present errors again, or 0000h, after emergencies may have been lost."""
+    def repeat(self, now: int, ended: GatewayError | None = None) -> None:
+        """Report all present errors again, or 0000h, after emergencies may have been lost.
+
+        ``ended`` is an error that has ended and was not reported. It follows the present ones.
+        """
         was_open = self._open
         self.close()
+        if ended is not None:
+            self.set(ended, True, now)
         self._unreported = dict(self._active)
         self._last_is_error = self._had_error
         if was_open:
             self.open(now)
+        if ended is not None:
+            self.set(ended, False, now)
 
     def advance(self, now: int) -> None:
         """Report delayed emergencies in order, and send those that the inhibit time permits."""

@@ -122,8 +122,14 @@ class Producer:
         self._dictionary = dictionary
         self._send = send
         self._period = 0
-        self._is_quiet = False
+        self.is_quiet = False
+        """True if no heartbeats are sent: in quiet mode, or because no frame may leave."""
         dictionary.bind(0x1017, written=self.configure)
+
+    @property
+    def is_on(self) -> bool:
+        """True if 1017h is not 0."""
+        return bool(self._period)
 
     def configure(self, now: int) -> None:
         """Take over 1017h. The next heartbeat is sent one new period from now."""
@@ -141,11 +147,11 @@ class Producer:
 
     def set_quiet(self, is_quiet: bool, now: int) -> None:
         """Send no heartbeats while ``is_quiet``. Afterwards, begin after one period."""
-        self._is_quiet = is_quiet
+        self.is_quiet = is_quiet
         self._set_due(now + self._period)
 
     def _set_due(self, due: int) -> None:
-        self.due = due if self._period and not self._is_quiet else NEVER
+        self.due = due if self._period and not self.is_quiet else NEVER
 
     def advance(self, now: int) -> None:
         """Send a heartbeat if it is due. Missed heartbeats are not sent later."""

@@ -285,9 +285,12 @@ class Node:
             self.producer.beat(now)
             self.repeat(now)
 
-    def repeat(self, now: int) -> None:
-        """Send active errors and PDOs that are sent on change again, because frames were lost."""
-        self.emergencies.repeat(now)
+    def repeat(self, now: int, ended: GatewayError | None = None) -> None:
+        """Send active errors and PDOs that are sent on change again, because frames were lost.
+
+        ``ended`` is an error that has ended and was not reported.
+        """
+        self.emergencies.repeat(now, ended)
         self.tpdos.repeat(now)
 
     def set_due(self) -> None:
@@ -304,6 +307,10 @@ class Node:
 
     def _send_sdo(self, data: bytes) -> None:
         self._send(SDO_ANSWER + self.node_id, data)
+
+    def heartbeat(self) -> CanFrame:
+        """Return a heartbeat. It is not sent."""
+        return CanFrame(HEARTBEAT + self.node_id, bytes([self.state]))
 
     def _send_heartbeat(self) -> None:
         self._send(HEARTBEAT + self.node_id, bytes([self.state]))

@@ -49,6 +49,8 @@ class Nodes(NodeOutput):
         """Heartbeats of our nodes, for those of our nodes that watch them."""
         self._is_on = False
         self._is_quiet = False
+        self._is_held = False
+        """True if no frame may leave. Frames of the return are made by it, not earlier."""
         self._reported: list[NodeState] = []
         """The states in the log."""
         numbers = range(len(host.escs))
@@ -97,33 +99,51 @@ class Nodes(NodeOutput):
         """Follow the CAN controller: another state, or DOWN again before a frame was sent."""
         if state is before and state is not CanState.DOWN:
             return
-        self._can_faults.on_state(state, now)
+        self._can_faults.on_state(state, self._is_held, now)
         self._finish(now)
 
     def can_returned(self, now: int, has_lost_frames: bool = False) -> None:
         if self._is_quiet:
             return
-        if not self._is_on:
+        if self._is_held:
+            self._is_held = False
+            self._can_faults.silence(self._is_quiet or self._is_held, now)
+            self._is_on = True
+            self._can_faults.return_held(now)
+        elif not self._is_on:
             self.start(now, can_open=True)
             return
-        self._can_faults.returned(now, has_lost_frames)
+        else:
+            self._can_faults.returned(now, has_lost_frames)
         self._finish(now)
 
-    def first_frame(self, _now: int) -> CanFrame | None:
-        if not self._is_on:
-            return None
+    def hold(self, now: int) -> None:
+        if not self._is_held:
+            self._is_held = True
+            self._can_faults.silence(self._is_quiet or self._is_held, now)
+            self._finish(now)
+
+    def first_frame(self, now: int) -> CanFrame | None:
+        """Return a boot-up if a node boots now, or a heartbeat if a node sends heartbeats."""
+        begin = len(self.frames)
+        if self._is_held and self._can_faults.boot_first(now):
+            self._is_on = True
+            boot_up = self.frames.pop(begin)
+            self._finish(now)
+            return boot_up
         for node in self.nodes:
-            if node.node_id != UNCONFIGURED:
-                return CanFrame(HEARTBEAT + node.node_id, bytes([node.state]))
+            # In captures of earlier versions, a heartbeat was sent even if 1017h is 0.
+            is_wanted = node.producer.is_on or not self._is_held
+            if self._is_on and is_wanted and node.node_id != UNCONFIGURED:
+                return node.heartbeat()
         return None
 
     def set_quiet(self, is_quiet: bool, now: int) -> None:
         self._is_quiet = is_quiet
         self._can_faults.set_quiet(is_quiet)
         for node in self.nodes:
-            node.emergencies.is_quiet = is_quiet
             node.consumer.set_quiet(is_quiet)
-            node.producer.set_quiet(is_quiet, now)
+        self._can_faults.silence(self._is_quiet or self._is_held, now)
         self._finish(now)
 
     def held_up(self, now: int) -> None:
@@ -286,25 +306,34 @@ class _CanFaults:
     """Faults of the CAN controller.
 
     They cause the emergencies 8110h, 8120h and 8140h and the error behaviour 1029h:1 of all nodes
-    (CiA 301, 7.5.2.27).
+    (CiA 301, 7.5.2.27). After an outage with held frames, each node that boots does so once: one as
+    the first frame, the others when the frames are released. Without ``hold``, as in captures of
+    earlier versions, they boot when the controller's state changes.
     """
 
     def __init__(self, nodes: Sequence[Node]) -> None:
         self._nodes = nodes
         self._next_overrun_ns = 0
         self._is_quiet = False
+        self._is_on = False
         self._was_off = False
         self._has_outage = False
+        self._booted: list[Node] = []
+        """Nodes that have booted since the outage began."""
         self._is_unsent = False
-        """True if frames about the end of an outage were made, and are not known to be sent."""
+        """True if frames about the end of an outage were made, and are not known to be sent.
+
+        Only captures of earlier versions can have such frames.
+        """
         self._unsent_was_off = False
 
     def power_on(self) -> None:
         """Forget faults from before the start."""
+        self._is_on = True
         self._was_off = False
         self._has_outage = False
 
-    def on_state(self, state: CanState, now: int) -> None:
+    def on_state(self, state: CanState, is_held: bool, now: int) -> None:
         """Follow a new state of the CAN controller."""
         # Bus-off is worse than error-passive, so it does not end the emergency.
         if state in (CanState.ERROR_PASSIVE, CanState.ERROR_ACTIVE, CanState.ERROR_WARNING):
@@ -314,15 +343,66 @@ class _CanFaults:
         if state in (CanState.BUS_OFF, CanState.DOWN):
             self._was_off = self._was_off or state is CanState.BUS_OFF
             self._has_outage = True
+            self._booted = []  # a boot-up that was under way is lost
             for node in self._nodes:
                 node.nmt.behave(1, now)
-        elif self._has_outage and state is not CanState.UNKNOWN:
+        elif self._has_outage and state is not CanState.UNKNOWN and not is_held:
             self.frames_pass(now)
 
     def set_quiet(self, is_quiet: bool) -> None:
         """Begin quiet mode, which is an outage for the nodes, or allow its end to be followed."""
         self._is_quiet = is_quiet
         self._has_outage = True
+        self._booted = []
+
+    def silence(self, is_silent: bool, now: int) -> None:
+        """Let the nodes make no heartbeats and emergencies, or make them again."""
+        for node in self._nodes:
+            node.emergencies.is_quiet = is_silent
+            if node.producer.is_quiet is not is_silent:
+                node.producer.set_quiet(is_silent, now)
+
+    def boot_first(self, now: int) -> bool:
+        """Boot one more node. Returns False if no further node with a node-ID boots."""
+        for node in self._nodes:
+            has_id = node.identity.pending_node_id != UNCONFIGURED
+            if has_id and node not in self._booted and self._boots(node):
+                self._booted.append(node)
+                self._boot(node, now)
+                return True
+        return False
+
+    def return_held(self, now: int) -> None:
+        """Follow the release of frames that were held."""
+        ended = GatewayError.BUS_OFF_LEFT if self._was_off else None
+        for node in self._nodes:
+            if node in self._booted:
+                node.repeat(now, ended)
+            elif self._boots(node):
+                self._boot(node, now)
+                if ended is not None:
+                    node.emergencies.pulse(ended, now)
+            else:
+                node.producer.beat(now)
+                node.repeat(now, ended)
+        self._is_on = True
+        self._was_off = False
+        self._has_outage = False
+        self._is_unsent = False
+        self._booted = []
+
+    def _boots(self, node: Node) -> bool:
+        """Return True if a node boots before its next frames."""
+        if not self._is_on:
+            return True
+        has_id = node.node_id != UNCONFIGURED
+        return self._has_outage and has_id and node.nmt.boots_after_outage
+
+    def _boot(self, node: Node, now: int) -> None:
+        if self._is_on:
+            node.reset_communication(now)
+        else:
+            node.reset_node(now)
 
     def frames_pass(self, now: int) -> None:
         """Follow an interface that takes frames again after some were lost."""

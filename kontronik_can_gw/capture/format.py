@@ -106,11 +106,21 @@ class EntryKind(IntEnum):
     HELD_UP = 20
     """The process was delayed. flags 1: pending measurements were dropped."""
     HOLD = 21
-    """No frame leaves the interface. Frames are held, and those of outputs were discarded."""
+    """No frame leaves the interface. Frames are held, and those of outputs were discarded.
+
+    flags 1: the outputs make no frames except answers, as since the gate to the bus.
+    """
     FIRST_FRAME = 22
     """While frames are held, one frame without measurements was sent."""
     RELEASE = 23
     """That frame has left the interface, and the others are sent again."""
+    LIMIT = 24
+    """flags 1: the bus is slow, so frames are taken by TAKE only. flags 0: it is not.
+
+    flags 3: measurements that waited were also discarded.
+    """
+    TAKE = 25
+    """The frames of outputs and the oldest messages were taken (``flags``: how many)."""
 
 
 _WITH_ARRIVAL = frozenset({EntryKind.BYTES, EntryKind.FRAME})

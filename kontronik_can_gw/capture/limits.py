@@ -57,6 +57,7 @@ _LIMITS_OF_GATEWAY = {
     "started_ns": END_OF_TIME - 1,
     "can_state": 5,
     "is_held": 1,
+    "is_limited": 1,
     "heard_ns": END_OF_TIME - 1,
 }
 

@@ -65,15 +65,27 @@ class RecordedGateway(Gateway):
         self._note(now, EntryKind.HELD_UP, flags=int(dropped))
         super().held_up(now, dropped)
 
-    def hold(self, now: int) -> None:
-        self._note(now, EntryKind.HOLD)
-        super().hold(now)
+    def hold(self, now: int, is_earlier: bool = False) -> None:
+        self._note(now, EntryKind.HOLD, flags=int(not is_earlier))
+        super().hold(now, is_earlier)
+
+    def limit(self, is_limited: bool, has_discarded: bool, now: int) -> None:
+        self._note(now, EntryKind.LIMIT, flags=is_limited | has_discarded << 1)
+        super().limit(is_limited, has_discarded, now)
+
+    def take_some(self, messages: int, now: int) -> list[CanFrame]:
+        if not self.output_frames and not (messages and self.core.is_pending):
+            return []
+        self._note(now, EntryKind.TAKE, flags=messages)
+        frames = super().take_some(messages, now)
+        self._counters = _with_sent(self._counters, len(frames))
+        return frames
 
     def first_frame(self, now: int) -> CanFrame | None:
         self._note(now, EntryKind.FIRST_FRAME)
         frame = super().first_frame(now)
         if frame is not None:
-            self._counters = (self._counters[0] + 1, *self._counters[1:])
+            self._counters = _with_sent(self._counters, 1)
         return frame
 
     def release(self, now: int) -> None:
@@ -118,7 +130,7 @@ class RecordedGateway(Gateway):
 
     def take_frames(self, now: int) -> list[CanFrame]:
         frames = super().take_frames(now)
-        self._expect_sent(len(frames))
+        self._counters = _with_sent(self._counters, len(frames))
         return frames
 
     def not_sent(self, now: int) -> None:
@@ -131,14 +143,9 @@ class RecordedGateway(Gateway):
 
     def turned(self, calls: Iterable[Call], frames: int) -> None:
         """Record the calls of the core by turns in C. ``frames``: number of frames taken."""
-        self._expect_sent(frames)
+        self._counters = _with_sent(self._counters, frames)
         for now, kind, esc, data, came in calls:
             self._put(now, kind, esc, data, 0, came)
-
-    def _expect_sent(self, frames: int) -> None:
-        """Count frames as sent. Usually all are, so only other changes need to be recorded."""
-        sent, *others = self._counters
-        self._counters = (sent + frames, *others)
 
     def _note_line_errors(self, now: int) -> None:
         for index, esc in enumerate(self.escs):
@@ -168,6 +175,15 @@ class RecordedGateway(Gateway):
             self._put(now, EntryKind.COUNTERS, 0, data, 0, None)
 
 
+def _with_sent(counters: tuple[int, ...], frames: int) -> tuple[int, ...]:
+    """Return counters with more sent frames.
+
+    Usually all frames are sent, so only other changes of the counters need to be recorded.
+    """
+    sent, *others = counters
+    return (sent + frames, *others)
+
+
 def state_of(gateway: Gateway) -> dict[str, Any]:
     """Return the state with which a replay can begin now."""
     escs = []
@@ -187,6 +203,7 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
         "counters": _counters_of(gateway.status),
         "can_state": int(gateway.status.can_state),
         "is_held": int(gateway.is_held),
+        "is_limited": int(gateway.is_limited),
         "started_ns": gateway.status.started_ns,
         "heard_ns": max([gateway.status.heard_ns, *[esc.live_ns or 0 for esc in gateway.escs]]),
     }

@@ -18,6 +18,7 @@ from kontronik_can_gw.capture.format import (
 )
 from kontronik_can_gw.capture.limits import LATER_OF_ESC, check_counters, check_state, check_time
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway.gate_table import UNLIMITED
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
 from kontronik_can_gw.status import CanState, GatewayState
@@ -134,6 +135,8 @@ class Replay:
         elif kind == EntryKind.STOP:
             gateway.stop(now)
             self._collect_frames(now)
+        elif kind == EntryKind.TAKE:
+            self._add_taken(gateway.take_some(min(flags, UNLIMITED), now), now)
         elif kind == EntryKind.COUNTERS:
             counters = read_numbers(data)
             check_counters(counters)
@@ -169,11 +172,14 @@ class Replay:
     def _collect_frames(self, now: int) -> None:
         gateway = self.gateway
         gateway.take_saves()  # otherwise the list would grow
-        frames = in_order(gateway.take_frames(now), self._waiting)
-        gateway.status.sent_frames += len(frames)
+        self._add_taken(gateway.take_frames(now), now)
         gateway.take_link_changes()
         gateway.take_rejected_parameters()
         gateway.conflicts.take()
+
+    def _add_taken(self, taken: list[CanFrame], now: int) -> None:
+        frames = in_order(taken, self._waiting)
+        self.gateway.status.sent_frames += len(frames)
         self._taken = [TimedFrame(now, frame) for frame in frames]
 
     def _adopt(self, state: Mapping[str, Any]) -> None:
@@ -201,6 +207,8 @@ class Replay:
             self.gateway.status.can_state = CanState(state["can_state"])
         if state.get("is_held"):
             self.gateway.is_held = True
+        if state.get("is_limited"):
+            self.gateway.is_limited = True
 
 
 def _repeat_rare(gateway: Gateway, entry: Entry) -> None:
@@ -217,7 +225,9 @@ def _repeat_rare(gateway: Gateway, entry: Entry) -> None:
         case EntryKind.CAN_RETURNED:
             gateway.can_returned(now)
         case EntryKind.HOLD:
-            gateway.hold(now)
+            gateway.hold(now, is_earlier=not entry.flags)
+        case EntryKind.LIMIT:
+            gateway.limit(bool(entry.flags & 1), bool(entry.flags & 2), now)
         case EntryKind.RELEASE:
             gateway.release(now)
         case EntryKind.HELD_UP:

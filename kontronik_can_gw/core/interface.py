@@ -145,3 +145,9 @@ class Core(Protocol):
 
         Slots are first. Both are in the order in which they became due.
         """
+
+    def take_oldest(self, now: int) -> list[CanFrame]:
+        """Return the frames of the slot or message that became due first.
+
+        The list is empty if it has nothing to send, for example because its value did not change.
+        """

@@ -380,6 +380,20 @@ class Messages:
                     frames.append(self._frame(message, now))
         return frames
 
+    @property
+    def pending_since(self) -> int:
+        """The time since which the oldest message is pending, or NEVER."""
+        return min(self.pending.values(), default=NEVER)
+
+    def take_oldest(self, now: int) -> list[CanFrame]:
+        """Return the frames of the message that became due first."""
+        others = self.pending
+        index = min(others, key=lambda each: (others[each], each))
+        self.pending = {index: others.pop(index)}
+        frames = self.take(now)
+        self.pending = others | self.pending
+        return frames
+
     def _prepare(self, message: _Message, why: int, now: int) -> bool:
         """Return True if a pending message is sent, and choose its pages.
 

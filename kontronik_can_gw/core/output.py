@@ -123,14 +123,24 @@ class Output:
     def on_can_state(self, before: CanState, state: CanState, now: int) -> None:
         """Follow the state of the CAN controller. DOWN may be followed by DOWN."""
 
+    def hold(self, now: int) -> None:
+        """Make no frames except answers until ``can_returned``, because no frame may leave.
+
+        Frames of earlier calls that were not sent are discarded. The call may be repeated.
+        """
+
     def can_returned(self, now: int, has_lost_frames: bool = False) -> None:
         """Follow an interface that takes frames again after a loss, or for the first time.
 
         ``has_lost_frames`` is True if frames that outputs made during the outage were discarded.
+        Only a gateway that was never held, and replays of captures of earlier versions, need it.
         """
 
     def first_frame(self, now: int) -> CanFrame | None:  # noqa: ARG002  see DroneCAN
-        """Return a frame without measurements as the first one after an outage, or None."""
+        """Return a frame without measurements as the first one after an outage, or None.
+
+        Another call asks for a further frame, because the last one has not left the interface.
+        """
         return None
 
     def set_quiet(self, is_quiet: bool, now: int) -> None:

@@ -190,6 +190,11 @@ class PythonCore:
         messages = self.messages.take(now)
         return slots + messages if slots else messages
 
+    def take_oldest(self, now: int) -> list[CanFrame]:
+        if self.slots.pending_since <= self.messages.pending_since:
+            return self.slots.take_oldest(now)
+        return self.messages.take_oldest(now)
+
     def _report(self, esc: int, events: int, now: int) -> None:
         """Pass events of an ESC to messages, followers and slots."""
         self.messages.on_event(esc, events, now)

@@ -364,6 +364,20 @@ class Slots:
         """True if ``take`` would return frames."""
         return bool(self.pending)
 
+    @property
+    def pending_since(self) -> int:
+        """The time since which the oldest slot is pending, or NEVER."""
+        return min(self.pending.values(), default=NEVER)
+
+    def take_oldest(self, now: int) -> list[CanFrame]:
+        """Return the frames of the slot that became due first."""
+        others = self.pending
+        place = min(others, key=lambda each: (others[each], each))
+        self.pending = {place: others.pop(place)}
+        frames = self.take(now)
+        self.pending = others | self.pending
+        return frames
+
     def take(self, now: int) -> list[CanFrame]:
         """Return the frames of the pending slots, in their order."""
         frames: list[CanFrame] = []

@@ -11,15 +11,15 @@ from kontronik_can_gw.core.output import NodeOutput, NodeState
 from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway.frame_source import FrameSource
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts
-from kontronik_can_gw.gateway.outage import HoldsFrames
 from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import NEVER
 
 
-class Gateway(HoldsFrames):
+class Gateway(FrameSource):
     """One gateway between several ESCs and one CAN bus.
 
     It sends the messages of the layout and the frames of ``outputs``. Each of the two may be empty.
@@ -58,8 +58,6 @@ class Gateway(HoldsFrames):
         ]
         self.conflicts = IdConflicts(self.core.own_ids, self.outputs)
         self._being_saved: list[tuple[int, NodeOutput]] = []
-        self._has_discarded = False
-        """True if measurements were discarded since the last ``advance``."""
 
     @property
     def core_note(self) -> str:
@@ -238,30 +236,6 @@ class Gateway(HoldsFrames):
         for output in self.outputs:
             due = min(due, output.next_deadline())
         return due
-
-    # --- frames to send
-
-    @property
-    def frames_wait(self) -> bool:
-        """True while ``take_frames`` has something to do."""
-        return not self.is_held and (bool(self.output_frames) or self.core.is_pending)
-
-    def take_frames(self, now: int) -> list[CanFrame]:
-        """Return the frames to send, packed with current values.
-
-        The outputs' own frames are first, oldest first. Then follow slots and messages, each in the
-        order in which they became due. While frames are held, there are none.
-        """
-        if self.is_held:
-            return []
-        frames = self.core.take(now)
-        if self.output_frames:
-            frames = self.output_frames + frames
-            self.output_frames.clear()
-        return frames
-
-    def not_sent(self, now: int) -> None:
-        """Note that the frames taken last were discarded. Only a recorded gateway needs this."""
 
 
 def _quiet_follower(gateway: Gateway) -> OnEvent:

@@ -162,6 +162,18 @@ class TransmitQueue:
         count = len(alternating) // 2
         return alternating + first[count:] + second[count:]
 
+    def share_of_measurements(self, room: int) -> int:
+        """Return how many measurements must be added if only ``room`` frames are sent next.
+
+        They alternate with the queued frames, and leave them half the room.
+        """
+        self._has_leftovers = True
+        measurements = room
+        if self._queued:
+            half = room // 2 if self._queue_has_turn else (room + 1) // 2
+            measurements = max(half, room - self._queued)
+        return max(0, measurements - (len(self._waiting) - self._queued))
+
     def remove(self, frames: Sequence[CanFrame], count: int) -> None:
         """Remove the first ``count`` of ``frames``, which were sent. ``in_order`` returned them.
 

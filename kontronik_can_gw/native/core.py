@@ -28,7 +28,7 @@ from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.native.turns import Turns
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import GatewayStatus
-from kontronik_can_gw.times import END_OF_TIME
+from kontronik_can_gw.times import END_OF_TIME, NEVER
 
 _MAX_FRAMES = 256
 _WORD = (1 << 64) - 1
@@ -276,6 +276,24 @@ class NativeCore:
         for slot in in_python:
             frames += slot.frames
         return frames
+
+    def take_oldest(self, now: int) -> list[CanFrame]:
+        count = self.state.pendings
+        pending = self.pending[:count]
+        messages = self.plan.messages
+        ages = [(self.sending[index].since, index < messages, index) for index in pending]
+        since, _, index = min(ages, default=(NEVER, False, 0))
+        if self._slots.pending_since <= since:
+            return self._slots.take_oldest(now)
+        others = [each for each in pending if each != index]
+        self.pending[0] = index
+        self.state.pendings = 1
+        taken = self.library.kcg_take(self.core, now, self._frames, _MAX_FRAMES)
+        self.library.kcg_sent(self.core, now, taken)
+        for place, other in enumerate(others, self.state.pendings):
+            self.pending[place] = other
+        self.state.pendings += len(others)
+        return frames_in(self._raw, 0, taken)
 
     def apply(self, esc: int, settings: EscSettings) -> None:
         _check(esc, 0, len(self.escs))

@@ -2,8 +2,8 @@
 
    The twins in Python describe each rule: runtime/loop.py (Loop.turn), runtime/poller.py,
    runtime/ports (serial_port.py and esc_port.py: reading, and since when bytes can have arrived),
-   gateway/transmit_queue.py (frames that wait), gateway/departures.py (a blocked bus) and
-   runtime/can/socketcan_port.py (sending).
+   gateway/transmit_queue.py (frames that wait) and runtime/can/socketcan_port.py (sending).
+   Python alone decides whether a frame may leave (gateway/gate.py).
 
    In this file "the loop" is the loop in Python. It does everything that these turns do not do: its
    next turn follows at once with all that is ready. */
@@ -26,10 +26,11 @@
 #define MAX_UNPOLLED (10 * MS) /* Saves polls: values of quiet ports may appear older by this. */
 #define CHECK_EACH (100 * MS)  /* Between checks of settings: an echo would send to the ESC. */
 enum {
-    CLASSIC_SIZE = 16, /* Size of struct can_frame. */
-    FD_SIZE = 72,      /* Size of struct canfd_frame. */
-    CHECKS = 3,        /* As in gateway/departures.py. */
-    MAX_DIGITS = 32    /* Bytes that are read of a number in /sys. */
+    CLASSIC_SIZE = 16,  /* Size of struct can_frame. */
+    FD_SIZE = 72,       /* Size of struct canfd_frame. */
+    MEMINFO_WORDS = 9,  /* Figures of SO_MEMINFO. */
+    MEMINFO_QUEUED = 2, /* Place of the memory of frames in the kernel's queue. */
+    MAX_DIGITS = 32     /* Bytes that are read of a number in /sys. */
 };
 
 static int64_t now_ns(void)
@@ -110,27 +111,46 @@ static int64_t frames_left(const kcg_turns *t)
     return size > 0 ? strtoll(digits, NULL, 10) : 0;
 }
 
-/* Checks whether frames have left the interface, if the check is due. Returns 1 if it is blocked.
-   The loop then checks again, and holds the frames. */
-static int is_blocked(kcg_turns *t)
+/* Returns how many own frames wait in the kernel's queue, or 0 if that is not known. */
+static int64_t frames_queued(const kcg_turns *t)
+{
+    uint32_t figures[MEMINFO_WORDS] = {0};
+    socklen_t size = sizeof figures;
+    if (getsockopt(t->request.bus, SOL_SOCKET, SO_MEMINFO, figures, &size) < 0)
+        return 0;
+    int64_t bytes = figures[MEMINFO_QUEUED], each = t->request.frame_size;
+    return each ? (bytes + each - 1) / each : bytes > 0;
+}
+
+/* Follows the frames that have left the interface, if the check is due. Returns 1 if a frame was
+   under way at the last check and still is. Then the loop looks closely (UnderWay.look). */
+static int is_late(kcg_turns *t)
 {
     kcg_departures *d = &t->departures;
     int64_t now = t->times.now;
     if (now < d->check_due)
         return 0;
-    int64_t count = frames_left(t);
-    int has_left = count != d->count;
-    d->waiting -= count - d->count;
-    d->waiting = d->waiting > 0 ? d->waiting : 0;
+    int64_t count = frames_left(t), queued = frames_queued(t);
+    int64_t frames = d->older + d->newer, left = count - d->count;
+    int has_left = left != 0;
+    if (!count || left < 0)
+        left = frames;
+    left = left < frames - queued ? left : frames - queued;
+    left = left > 0 ? left : 0;
+    int64_t of_older = left < d->older ? left : d->older;
+    d->older -= of_older;
+    d->newer -= left - of_older;
     d->count = count;
-    if (!has_left && count && now - d->waits_since >= CHECKS * t->request.check_period) {
+    if (has_left)
+        d->still_since = frames > left ? now : KCG_DRAINED;
+    if (d->older) {
         d->check_due = now;
         return 1;
     }
-    if (has_left)
-        d->waits_since = d->waiting ? now : KCG_DRAINED;
-    int is_empty = d->waits_since == KCG_DRAINED;
-    d->check_due = is_empty ? KCG_DRAINED : now + t->request.check_period;
+    d->older = d->newer;
+    d->newer = 0;
+    d->checked = now;
+    d->check_due = d->older ? now + t->request.check_period : KCG_DRAINED;
     return 0;
 }
 
@@ -174,11 +194,13 @@ static int hand_over(kcg_turns *t)
             sent += (uint32_t)result;
     }
     t->core->gateway[KCG_SENT_FRAMES] += sent;
-    t->departures.waiting += sent;
-    if (sent && t->departures.waits_since == KCG_DRAINED) {
-        t->departures.waits_since = t->times.now;
-        t->departures.check_due = t->times.now + t->request.check_period;
+    kcg_departures *d = &t->departures;
+    if (sent && !d->older && !d->newer) {
+        d->still_since = d->checked = t->times.now;
+        d->check_due = t->times.now + t->request.check_period;
     }
+    d->accepted += sent;
+    d->newer += sent;
     q->count -= sent;
     q->from_outputs -= sent < q->from_outputs ? sent : q->from_outputs;
     memmove(q->frame, q->frame + sent, q->count * sizeof *q->frame);
@@ -431,7 +453,7 @@ static int turn(kcg_turns *t)
         if (!serve(t))
             return 0;
     if (*event < 0 && !r->has_advanced) {
-        if (is_blocked(t))
+        if (is_late(t))
             return 0;
         if (is_idle(t))
             return may_wait(t);
@@ -448,6 +470,7 @@ void kcg_begin(kcg_turns *t)
 {
     kcg_turn_ports *p = &t->ports;
     t->result.event = -1;
+    t->departures.accepted = 0;
     t->result.turns = t->result.taken = t->result.recorded = t->result.is_over = 0;
     t->queue.count = t->queue.from_outputs = 0;
     for (uint32_t i = 0; i < p->count; i++) {

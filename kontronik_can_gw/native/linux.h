@@ -50,6 +50,7 @@ typedef struct {
     int64_t max_late;     /* Return if a turn is later than this: the process was held up. */
     int64_t max_turn;     /* Do not send frames whose turn has lasted longer than this. */
     int64_t check_period; /* Time between two checks of `departures`. */
+    int64_t frame_size;   /* Memory of a frame in the kernel's queue in bytes. 0: unknown. */
     int32_t bus;          /* Socket of the CAN interface. */
     int32_t count_fd;     /* File with the interface's number of sent frames, or -1. */
     uint32_t is_recorded; /* 1: record each call of the core in `ring`. */
@@ -95,9 +96,18 @@ typedef struct {
     kcg_frame made[KCG_MADE]; /* Frames that were just taken from the core. */
 } kcg_turn_queue;
 
-/* Frames that the interface has accepted (twin: gateway/departures.py, which describes the fields).
-   NEVER is KCG_DRAINED. The owner writes them before kcg_begin and reads them after a run. */
-typedef struct { int64_t count, waits_since, check_due, waiting; } kcg_departures;
+/* Frames that the interface has accepted. The gate in Python decides about them (gateway/gate.py).
+   C only returns if a frame is under way for longer than a check period. The owner writes the
+   fields before kcg_begin and reads them after a run. NEVER is KCG_DRAINED. */
+typedef struct {
+    int64_t count;       /* The interface's number of sent frames at the last check. */
+    int64_t still_since; /* Frames are under way and none has left since then, or NEVER. */
+    int64_t checked;     /* Time of the last check. */
+    int64_t check_due;   /* Time of the next check, or NEVER. */
+    int64_t accepted;    /* Frames that were accepted since kcg_begin. */
+    int64_t older;       /* Frames under way that were accepted before the last check. */
+    int64_t newer;       /* Frames under way that were accepted since then. */
+} kcg_departures;
 
 /* The descriptors that are watched. */
 typedef struct {

@@ -252,7 +252,8 @@ def _can_facts(can: CanLink, conditions: FaultLog) -> CanFacts:
     faults = (
         can.opening_condition,
         can.condition,
-        can.transmitter.condition,
+        can.transmitter.reports.stalled,
+        can.transmitter.reports.slow,
         can.controller.condition,
     )
     return CanFacts(
@@ -261,7 +262,8 @@ def _can_facts(can: CanLink, conditions: FaultLog) -> CanFacts:
         bitrate=bitrate or None,
         open=can.is_open,
         complaint=next(filter(None, map(conditions.reason, faults)), ""),
-        stalled=can.transmitter.is_stalled,
+        stalled=can.gate.is_stalled,
+        slow=can.gate.is_slow,
         restart_ms=known.restart_ms,
         error_counters=known.error_counters,
     )

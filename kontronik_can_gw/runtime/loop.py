@@ -219,6 +219,7 @@ class Loop:
             self._saver.save(
                 now
             )  # first, so that its answers are sent in this turn, as in a replay
+        can.look(now)
         gateway.advance(now)
         if has_outputs:
             self._follow_outputs(now)
@@ -243,6 +244,7 @@ class Loop:
         now = self._clock()
         self._housekeeping.follow_recorder(now)  # records the devices
         self.gateway.stop(now)
+        self.can.gate.stop(now)
         self.can.transmit(now)
         self.conditions.log(logging.INFO, f"{self._reason} {totals(self.gateway, now)}")
         self.close()
@@ -295,7 +297,7 @@ class Loop:
             "measurements that waited to be sent are discarded and replaced by current ones"
         )
         self.conditions.event("suspended", text, now)
-        self.gateway.held_up(now, self.can.transmitter.drop_measurements())
+        self.gateway.held_up(now, self.can.transmitter.suspended(now))
 
     def _reopen(self, now: int) -> int:
         """Open lost ports and the interface if that is due.

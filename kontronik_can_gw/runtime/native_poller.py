@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
+from kontronik_can_gw.esc.telemetry import Event
+from kontronik_can_gw.gateway.gate import Gate
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native.turns import OUTPUTS
 from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
@@ -100,7 +102,8 @@ class NativePoller(Poller):
         times.now = last
         times.polled = self.now
         times.bus_empty = self.before
-        _copy_departures(can.transmitter.departures, turns.departures)
+        gate = can.gate
+        _write_departures(gate, turns.departures)
         request.leave = min(leave, last + _HANDOVER_NS) if gateway.is_recorded else leave
         request.due = min(due, self._core.deadline_in_python())
         request.outputs_due = gateway.next_deadline(with_core=False)
@@ -116,7 +119,7 @@ class NativePoller(Poller):
                     self._core.receive(*turns.read())
                 turns.leave()
                 break
-        _copy_departures(turns.departures, can.transmitter.departures)
+        _read_departures(turns.departures, gate, times.now)
         self.count += result.turns
         self.before = times.bus_empty
         self.now = times.polled
@@ -136,7 +139,8 @@ class NativePoller(Poller):
         request.count_fd = port.count_fd
         max_turn_ns = transmitter.max_turn_ns()
         request.period = period_ns
-        request.check_period = transmitter.check_period_ns
+        request.check_period = transmitter.gate.period_ns
+        request.frame_size = port.frame_size
         request.max_turn = max_turn_ns
         request.max_late = max(MIN_HELD_UP_NS, max_turn_ns)
 
@@ -156,14 +160,13 @@ class NativePoller(Poller):
         request = turns.request
         event, now = turns.result.event, turns.times.now
         revision = gateway.revision
-        was_quiet = gateway.status.is_quiet
         if is_due := event == OUTPUTS:
             gateway.advance(now, with_core=False)
         else:
             core.dispatch(event, now)
         if core.link_changes or core.reports_live or gateway.revision != revision:
             return False
-        if gateway.status.is_quiet != was_quiet:
+        if not is_due and event & Event.QUIET:  # the gate follows it
             return False
         request.outputs_due = outputs_due = gateway.next_deadline(with_core=False)
         request.due = due = min(request.due, core.deadline_in_python())
@@ -182,12 +185,29 @@ class NativePoller(Poller):
         return self._fits
 
 
-def _copy_departures(source: Any, target: Any) -> None:
-    """Copy the fields that ``Departures`` and kcg_departures share."""
-    target.count = source.count
-    target.waits_since = source.waits_since
-    target.check_due = source.check_due
-    target.waiting = source.waiting
+def _write_departures(gate: Gate, departures: Any) -> None:
+    """Tell turns in C which frames are under way."""
+    under_way = gate.under_way
+    departures.count = under_way.count
+    departures.still_since = gate.still_since
+    departures.checked = under_way.looked
+    departures.older = under_way.frames
+    departures.newer = 0
+    departures.check_due = gate.look_due
+
+
+def _read_departures(departures: Any, gate: Gate, now: int) -> None:
+    """Tell the gate which frames are under way after turns in C."""
+    gate.adopt(
+        departures.count,
+        departures.accepted,
+        departures.older,
+        departures.newer,
+        departures.checked,
+        departures.still_since,
+        departures.check_due,
+        now,
+    )
 
 
 def _plain_port(can: "CanLink", gateway: Gateway) -> "CanPort | None":

@@ -24,6 +24,7 @@ typedef struct {
     int (*size)(int fd, int most);
     int (*send)(const uint8_t *frame, int size); /* errno, or 0 if the bus takes the frame */
     int64_t (*left)(void); /* number of frames that have left the interface */
+    int (*queued)(void);   /* bytes of the frames in the kernel's queue */
     void (*settings)(int fd, uint8_t *at, int is_set); /* sets or reads the settings of a port */
 } kernel;
 static kernel k;
@@ -114,6 +115,14 @@ ssize_t fake_pread(int fd, void *data, size_t most, off_t at)
 {
     (void)fd, (void)at;
     return snprintf(data, most, "%lld\n", (long long)k.left());
+}
+
+int fake_getsockopt(int fd, int level, int name, void *data, socklen_t *size)
+{
+    uint32_t *figures = data;
+    (void)fd, (void)level, (void)name, (void)size;
+    figures[2] = (uint32_t)k.queued();
+    return 0;
 }
 
 ssize_t fake_read(int fd, void *data, size_t most)

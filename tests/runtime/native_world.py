@@ -27,12 +27,15 @@ from kontronik_can_gw.runtime.ports.serial_port import PortLost
 if TYPE_CHECKING:
     from wire_world import World
 
+FRAME_SIZE = 768
+"""Memory of a frame in the kernel's queue, in bytes."""
 _CALLS = (
     "clock_gettime",
     "epoll_create1",
     "epoll_ctl",
     "epoll_wait",
     "close",
+    "getsockopt",
     "poll",
     "pread",
     "read",
@@ -59,6 +62,7 @@ class _Kernel(c.Structure):
         ("size", c.CFUNCTYPE(c.c_int, c.c_int, c.c_int)),
         ("send", c.CFUNCTYPE(c.c_int, c.POINTER(c.c_uint8), c.c_int)),
         ("left", c.CFUNCTYPE(c.c_int64)),
+        ("queued", c.CFUNCTYPE(c.c_int)),
         ("settings", c.CFUNCTYPE(None, c.c_int, c.POINTER(c.c_uint8), c.c_int)),
     )
 
@@ -94,6 +98,7 @@ class FakeNativePoller(NativePoller):
             self._read,
             self._send,
             lambda: world.bus.frames_left(),
+            lambda: world.bus.frames_queued() * FRAME_SIZE,
             self._settings,
         ]
         pairs = zip(kinds, calls, strict=True)

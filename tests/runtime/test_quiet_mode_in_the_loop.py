@@ -8,11 +8,9 @@ from packer_oracle import Msg, Sig, dbc_text
 from wire_world import TIMES, World, loop_in, run, speed_and_age
 
 from kontronik_can_gw.canopen.setup import shipped_canopen
-from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.transmit_queue import Sent
-from kontronik_can_gw.runtime.can.interface_restart import InterfaceRestart
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.status import GatewayState
 from kontronik_can_gw.times import MS, SECOND
@@ -33,7 +31,12 @@ LAYOUT = compiled(
 class Bench:
     """A loop whose ESC sends for a second and is then silent, until quiet mode has begun."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *outputs: OutputMaker) -> None:
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        *outputs: OutputMaker,
+        restart_after_s: float = 0,
+    ) -> None:
         self.world = World()
         self.loop: Loop = loop_in(
             self.world,
@@ -42,6 +45,7 @@ class Bench:
             LAYOUT,
             outputs=outputs,
             quiet_after_s=QUIET_AFTER_S,
+            restart_after_s=restart_after_s,
         )
         self.loop.open()
         self.loop.begin()
@@ -130,15 +134,13 @@ def test_nothing_is_handed_over_behind_frames_that_do_not_leave(
     monkeypatch: pytest.MonkeyPatch, request_comes: bool
 ) -> None:
     """The other devices sleep already, so no one acknowledges the last frames."""
-    bench = Bench(monkeypatch, shipped_canopen([1]))
+    bench = Bench(monkeypatch, shipped_canopen([1]), restart_after_s=0.5)
     bus = bench.world.bus
     bus.frame_ns = MS // 4
     bench.run(QUIET_AFTER_S - 0.1)
     bus.block()
     asked: list[str] = []
-    config = CanConfig(channel="world", restart_after_s=0.5)
-    can = bench.loop.can
-    can._restart = InterfaceRestart(config, can._gateway, bench.loop.conditions, asked.append)
+    bench.loop.can.transmitter.ask_restart = asked.append
     bench.run(3)
     assert bench.is_quiet
     assert bench.loop.gateway.is_held

@@ -21,6 +21,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
+from kontronik_can_gw.gateway.gate_state import Restarts
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native import load
@@ -195,9 +196,12 @@ class Bus(CanPort):
         self.arrived: list[tuple[int, CanFrame]] = []
         """The frames that have left the interface, with their times, if ``frame_ns`` is not 0."""
         self.count_fd = CAN_FD + 1
+        self.frame_size = native_world.FRAME_SIZE
         self._out: list[tuple[int, CanFrame]] = []
         """The frames in the kernel, and the times at which they will have been sent."""
         self._is_blocked = False
+        self.passes = 0
+        """Number of frames that a blocked interface still takes."""
         self._count = 1
         """Number of frames that have left the interface."""
         self.on_send: Callable[[CanFrame], None] = lambda _frame: None
@@ -243,6 +247,11 @@ class Bus(CanPort):
         self._pass_time()
         return self._count
 
+    def frames_queued(self) -> int:
+        """Return how many frames wait behind the one in the controller."""
+        self._pass_time()
+        return max(0, len(self._out) - 1)
+
     def block(self) -> None:
         """Let no frame leave the interface until ``free`` is called. ``frame_ns`` must be set."""
         self._pass_time()
@@ -270,6 +279,10 @@ class Bus(CanPort):
     def _pass_time(self) -> None:
         """Move the frames that have been sent by now to ``arrived``."""
         now = self._world.now
+        if self._is_blocked and self.passes:
+            passed = self._out[: self.passes]
+            self.passes -= len(passed)
+            self._out[: len(passed)] = [(now, frame) for _, frame in passed]
         sent = [each for each in self._out if each[0] <= now]
         self.arrived += sent
         self._count += len(sent)
@@ -432,6 +445,7 @@ def loop_in(
     notifier: Notifier | None = None,
     outputs: Sequence[OutputMaker] = (),
     quiet_after_s: int = 0,
+    restart_after_s: float = 0,
 ) -> Loop:
     """Return a loop whose ports, bus and time are the World's. It is not open yet."""
 
@@ -448,13 +462,18 @@ def loop_in(
     if in_c:
         patch.setattr(load, "library", lambda: (native_world.library(), ""))
     layout = layout or layout_of(escs)
-    config = CanConfig(interface="virtual", channel="world", quiet_after_s=quiet_after_s)
+    config = CanConfig(
+        interface="virtual",
+        channel="world",
+        quiet_after_s=quiet_after_s,
+        restart_after_s=restart_after_s,
+    )
     gateway = Gateway(
         escs, layout, world.now, outputs=outputs, quiet_after_ns=config.quiet_after_ns
     )
     paths = list(by_path)
     poller = native_world.FakeNativePoller(world, gateway) if in_c else world.poller
-    return Loop(
+    loop = Loop(
         gateway,
         paths,
         config,
@@ -463,6 +482,10 @@ def loop_in(
         poller=poller,
         notifier=notifier,
     )
+    if restart_after_s:  # the gate of a SocketCAN interface
+        after_ns = round(restart_after_s * SECOND)
+        loop.can.gate.restart = Restarts(after_ns, after_ns)
+    return loop
 
 
 def run(loop: Loop, world: World, until: int) -> None:

@@ -228,6 +228,8 @@ def _troubles(document: Document) -> Iterator[str]:
         yield can["complaint"] or f"{channel} is bus-off"
     elif can["stalled"]:
         yield can["complaint"] or f"{channel}: no frame can be sent"
+    elif can.get("slow"):  # earlier versions do not have it
+        yield can["complaint"] or f"{channel}: the bus is slow"
     is_quiet = document["gateway"]["state"] == "quiet"
     for esc in document["escs"]:
         port = esc["port"]

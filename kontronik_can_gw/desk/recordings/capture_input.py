@@ -193,7 +193,9 @@ class CaptureInput(PlayedInput):
                     checked = self._checked(entry)
                     frames = [] if checked is None else replay.play(checked)
                     if kind != EntryKind.NOT_SENT:
-                        in_python = kind != EntryKind.ADVANCE or replay.gateway.is_held
+                        gateway = replay.gateway
+                        is_free = not (gateway.is_held or gateway.is_limited)
+                        in_python = kind != EntryKind.ADVANCE or not is_free
                     yield frames
                 else:
                     yield replay.finish()

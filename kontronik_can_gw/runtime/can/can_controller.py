@@ -4,6 +4,7 @@ The sources are the port's error frames and the kernel's reports by rtnetlink.
 """
 
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.gateway.gate import Gate
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.can.can_port import CanPort
 from kontronik_can_gw.runtime.can.link_commands import restart
@@ -18,8 +19,6 @@ ASK_OFF_NS = 100 * MS
 """The same interval in bus-off."""
 ASK_RESTARTING_NS = 20 * MS
 """The same interval after a restart, until the driver reports another state than bus-off."""
-SETTLING_NS = 200 * MS
-"""Time after which a restarted controller is used even if its driver still reports bus-off."""
 RESTARTED_NS = SECOND
 """Time after a restart in which a driver's report of bus-off is ignored, because it may be old."""
 UNCONFIRMED_OFF_NS = SECOND
@@ -33,7 +32,9 @@ The kernel has no controller for a virtual interface, and no information on pyth
 class CanController:
     """The state of an interface's CAN controller."""
 
-    def __init__(self, config: CanConfig, gateway: Gateway, conditions: FaultLog) -> None:
+    def __init__(
+        self, config: CanConfig, gateway: Gateway, gate: Gate, conditions: FaultLog
+    ) -> None:
         self.facts: LinkFacts | None = None
         """The kernel's last report. None if it does not report this interface."""
         self.is_off = False
@@ -43,9 +44,8 @@ class CanController:
         self.condition = f"CAN {config.channel}: controller"
         self._config = config
         self._gateway = gateway
+        self._gate = gate
         self._conditions = conditions
-        self._runs_since: int | None = None
-        """Time since which the interface runs again although the driver reports bus-off."""
         self._off_since = 0
         self._restarted_ns = -RESTARTED_NS
         self._monitor: LinkMonitor | None = None
@@ -55,11 +55,9 @@ class CanController:
             self.due = 0
 
     @property
-    def stays_off_since(self) -> int | None:
-        """Time of a bus-off that does not end by itself (restart-ms 0). None otherwise."""
-        if not self.is_off or self.facts is None or self.facts.restart_ms != 0:
-            return None
-        return self._off_since
+    def stays_off(self) -> bool:
+        """True if a bus-off does not end by itself (restart-ms 0)."""
+        return self.facts is not None and self.facts.restart_ms == 0
 
     def fileno(self) -> int | None:
         """Return a descriptor that is readable when the kernel has sent a report.
@@ -135,7 +133,6 @@ class CanController:
             if not self._has_restarted(now):
                 return
             self._restarted_ns = now
-            self._runs_since = None
         self.is_off = port.state is CanState.BUS_OFF
         self._off_since = now
         self._gateway.set_can_state(port.state, now)
@@ -158,20 +155,17 @@ class CanController:
 
         Frames that are sent earlier are lost without an error. The kernel first reports
         "restarted", then starts the queue and then the controller, and changes its state last.
-        Some drivers change it late. They are waited for only for SETTLING_NS.
+        Some drivers change it late. The gate waits for them only for a short time.
         """
         self.refresh(now)
-        if self.facts is None:
-            return True
-        if not self.facts.up or not self.facts.running:
-            self._runs_since = None
-            return False
-        if self.facts.state is CanState.BUS_OFF:
-            if self._runs_since is None:
-                self._runs_since = now
+        facts = self.facts
+        if facts is None:
+            return self._gate.left_bus_off(is_running=True, is_reported=False, now=now)
+        is_running = facts.up and facts.running
+        is_reported = facts.state is CanState.BUS_OFF
+        if is_running and is_reported:
             self.due = now + ASK_RESTARTING_NS
-            return now - self._runs_since > SETTLING_NS
-        return True
+        return self._gate.left_bus_off(is_running, is_reported, now)
 
     def _follow_bitrate(self, bitrate: int | None, now: int) -> None:
         if not bitrate:
@@ -187,7 +181,7 @@ class CanController:
             self._conditions.begin(condition, text, now)
 
     def _restart_hint(self) -> str:
-        if self.facts is None or self.facts.restart_ms != 0:
+        if not self.stays_off:
             return ""
         name = self._config.channel
         return (

@@ -17,9 +17,7 @@ from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.runtime.can.can_controller import CanController
 from kontronik_can_gw.runtime.can.can_opener import CanOpener
 from kontronik_can_gw.runtime.can.can_port import CanPort
-from kontronik_can_gw.runtime.can.interface_restart import InterfaceRestart
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
-from kontronik_can_gw.runtime.can.quiet_mode import QuietMode
 from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
 from kontronik_can_gw.runtime.can.transmitter import Transmitter
 from kontronik_can_gw.runtime.poller import Poller
@@ -28,12 +26,11 @@ from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.runtime.system.locks import IdLocks
 from kontronik_can_gw.status import CanState
-from kontronik_can_gw.times import NEVER, SECOND
+from kontronik_can_gw.times import SECOND
 
 MAX_RETRY_NS = SECOND // 2
 SLOW_OPENING_NS = 10 * SECOND
 """A driver that takes longer to open an interface is reported. slcan sleeps for two seconds."""
-_OK = Sent.OK  # an enumeration's members are slow to look up
 
 
 class CanLink:
@@ -54,14 +51,14 @@ class CanLink:
     ) -> None:
         self.config = config
         self.port: CanPort | None = None
-        self.transmitter = Transmitter(config.channel, gateway, conditions, clock)
-        self.controller = CanController(config, gateway, conditions)
+        self.transmitter = Transmitter(config, gateway, conditions, self._end_fault, clock)
+        self.gate = self.transmitter.gate
+        self.controller = CanController(config, gateway, self.gate, conditions)
         self._gateway = gateway
         self._poller = poller
         self._conditions = conditions
         self.condition = f"CAN {config.channel}: interface"
         self.opening_condition = f"CAN {config.channel}: opening"
-        self._quiet = QuietMode(config, gateway, self.transmitter, conditions)
         self._opening_since: int | None = None
         """Start of the opening by the opener's thread. None if the thread does not open."""
         self._clock = clock
@@ -69,8 +66,6 @@ class CanLink:
         self._own_ids = IdLocks(config, gateway, conditions)
         self._receive_ids: frozenset[int] | None = None
         """The ids that the open port receives."""
-        self.is_proven = False
-        """True if the interface has sent a frame since its last failure."""
         self._drained = True
         self._noted = PortInput()
         self._stuck = StuckCheck(self._noted)
@@ -79,7 +74,6 @@ class CanLink:
             poller.register(fd, self.hear)
         self.must_open = False
         """True during the first opening by the thread, if its failure ends the gateway."""
-        self._restart = InterfaceRestart(config, gateway, conditions)
         self._opener = CanOpener(config, esc_at)
         poller.register(self._opener.fileno(), self._follow_opener)
 
@@ -90,12 +84,17 @@ class CanLink:
         Except in bus-off the loop asks the controller in any of its turns, and need not wake up
         for that.
         """
-        due = min(self.transmitter.due, self._quiet.due)
+        due = self.gate.due
         if self.controller.is_off:
             due = min(due, self.controller.due)
         if self._retry.due is not None:
             due = min(due, self._retry.due)
         return due
+
+    @property
+    def is_proven(self) -> bool:
+        """True if the interface has sent a frame since its last failure."""
+        return self.gate.has_proof
 
     @property
     def is_open(self) -> bool:
@@ -170,6 +169,7 @@ class CanLink:
         port = self._opener.open()
         if port is None:
             self._opening_since = now
+            self.gate.opening(now)
             return False
         self._use(port, now)
         return True
@@ -178,7 +178,7 @@ class CanLink:
         """Use an open port."""
         self.port = port
         self._retry.due = None
-        self.transmitter.use(port)
+        self.gate.opened(port.frames_left(), now, port.is_socket)
         self.controller.is_off = False
         self._stuck = StuckCheck(self._noted)
         fd = port.fileno()
@@ -194,10 +194,9 @@ class CanLink:
         elif not self._conditions.is_on(self.condition):
             # After a failure, the recovery is logged when the first frame is sent.
             self._conditions.log(logging.INFO, text)
-        self._quiet.opened(self.condition, text, now)
+        self.transmitter.work(now)
 
     def _close_port(self) -> None:
-        self.transmitter.forget_failures()
         if self.port is not None:
             fd = self.port.fileno()
             if fd is not None:
@@ -206,20 +205,18 @@ class CanLink:
             self._opener.close_port(self.port)
             self.port = None
 
-    def _failed(self, reason: str, now: int) -> None:
-        self.is_proven = False
+    def _failed(self, reason: str, now: int, is_down: bool = False) -> None:
         self._retry.failed(now)
-        self.transmitter.clear()
+        self.gate.lost(is_down, now)
+        self.transmitter.work(now)
         self._gateway.set_can_state(CanState.DOWN, now)
         sentence = reason if reason.endswith(".") else f"{reason}."  # drivers write no full stop
         self._conditions.begin(self.condition, f"{sentence} Trying again.", now)
 
     def _lost(self, answer: Sent, now: int) -> None:
         """Close an interface that is down or was removed, and schedule its opening."""
-        if answer is Sent.DOWN:
-            self._restart.went_down(now)
         self._close_port()
-        self._failed(_reason_of_loss(self.config, answer), now)
+        self._failed(_reason_of_loss(self.config, answer), now, answer is Sent.DOWN)
         self.controller.ask(now)  # it may already be usable again
 
     # --- receiving
@@ -230,6 +227,7 @@ class CanLink:
         self.hear(now)
         if self.port is not None:
             self.controller.end_unconfirmed_off(self.port, now)
+        self.transmitter.advance(now)
 
     def hear(self, now: int, _events: int = 0) -> None:
         """Use the kernel's reports on the interface. Call it when they are readable."""
@@ -266,7 +264,7 @@ class CanLink:
         if self.port is None:
             return
         if events & select.POLLOUT:
-            self.transmitter.due = NEVER
+            self.gate.made_room()
             self._watch(select.POLLIN)
         if events & select.POLLIN:
             since = self._poller.before if self._drained else 0
@@ -287,27 +285,22 @@ class CanLink:
         """Return True if the loop does not serve this port."""
         return self._stuck.is_stuck(self.port)
 
+    def look(self, now: int) -> None:
+        """Follow the frames that have left. Call it before time passes for the gateway."""
+        if self.port is not None:
+            self.transmitter.look(self.port, now)
+
     def transmit(self, now: int) -> None:
         """Hand the due frames to the interface until it refuses one. In bus-off they are held."""
         port = self.port
-        self._quiet.follow(now)
-        if port is None or self.controller.is_off:
-            self.transmitter.hold(now)  # they would be lost, or sent late after the restart
-            self.transmitter.forget_failures()
-            off_since = self.controller.stays_off_since
-            if port is not None and off_since is not None:
-                self._restart.follow(off_since, now)
+        if port is not None and self.controller.is_off:
+            self.gate.bus_off(self.controller.stays_off, now)
+        answer = self.transmitter.transmit(port, now)
+        if port is None or answer is None:
             return
-        answer = self._quiet.transmit(port, now)
-        self._restart.follow(self.transmitter.outage_since, now)
-        if answer is None:
-            return
-        if answer is _OK:
-            if not self.is_proven and not self._gateway.is_held:
-                self._prove(now)
-        elif answer is Sent.FULL:
+        if answer is Sent.FULL:
             self._watch(select.POLLIN | select.POLLOUT)
-        elif answer is not Sent.BUSY:
+        elif answer is Sent.DOWN or answer is Sent.GONE:
             self._lost(answer, now)
             return
         self.controller.follow(port, now)
@@ -317,9 +310,8 @@ class CanLink:
         if fd is not None:
             self._poller.register(fd, self.serve, events)
 
-    def _prove(self, now: int) -> None:
+    def _end_fault(self, now: int) -> None:
         """End the fault of the interface, because it sends frames."""
-        self.is_proven = True
         self._retry.succeeded()
         text = f"CAN {self.config.channel}: frames are sent again"
         self._conditions.end(self.condition, text, now)

@@ -56,6 +56,8 @@ class CanPort(ABC):
         """True if the last ``receive`` left no frame, including frames that it does not return."""
         self.count_fd = -1
         """Descriptor of the file with the number of ``frames_left``, or -1 if there is none."""
+        self.frame_size = 0
+        """Memory of a frame in the kernel's queue in bytes, as far as known. 0 if unknown."""
         self._ids: frozenset[int] = frozenset()
         self._blocks: tuple[int, ...] = ()
         self._known_drops = 0
@@ -103,6 +105,10 @@ class CanPort(ABC):
 
         0 if the number is not known.
         """
+        return 0
+
+    def frames_queued(self) -> int:
+        """Return how many own frames wait in the kernel's queue. 0 if that is not known."""
         return 0
 
     def discard(self) -> None:

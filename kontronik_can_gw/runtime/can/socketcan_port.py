@@ -69,8 +69,12 @@ _ANCILLARY_SIZE = 64
 _MAX_DIGITS = 32
 """Bytes that are read of a number in /sys."""
 _SO_MEMINFO = 55
-"""Requests the kernel's figures of a socket. The last one counts frames dropped by a full queue."""
+"""Requests the kernel's figures of a socket."""
 _MEMINFO = struct.Struct("=9I")
+_QUEUED_BYTES = 2
+"""Place of the memory of the frames that were accepted and that no driver has taken."""
+_DROPPED = 8
+"""Place of the number of frames that a full queue has dropped."""
 
 
 class SocketCanPort(CanPort):
@@ -107,6 +111,20 @@ class SocketCanPort(CanPort):
         try:
             return int(os.pread(self.count_fd, _MAX_DIGITS, 0))
         except (OSError, ValueError):  # the interface was removed
+            return 0
+
+    def frames_queued(self) -> int:
+        size = self._meminfo(_QUEUED_BYTES)
+        if size:
+            self.frame_size = min(size, self.frame_size or size)
+        return -(-size // self.frame_size) if size else 0
+
+    def _meminfo(self, place: int) -> int:
+        """Return one of the kernel's figures of the socket. 0 if an old kernel does not have it."""
+        try:
+            found = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+            return int(_MEMINFO.unpack(found)[place])
+        except (OSError, struct.error):
             return 0
 
     def _filter(self) -> None:
@@ -148,11 +166,7 @@ class SocketCanPort(CanPort):
         return frames
 
     def _drops(self) -> int:
-        try:
-            found = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
-            return int(_MEMINFO.unpack(found)[-1])
-        except (OSError, struct.error):  # an old kernel has fewer figures
-            return 0
+        return self._meminfo(_DROPPED)
 
     def _follow(self, can_id: int, detail: int) -> None:
         if can_id & _ERR_BUS_OFF:

@@ -73,6 +73,9 @@ class CanFacts(NamedTuple):
     open: bool
     complaint: str = ""
     stalled: bool = False
+    """True if no frame can be sent."""
+    slow: bool = False
+    """True if the bus takes so few frames that some measurements are not sent."""
     restart_ms: int | None = None
     error_counters: tuple[int, int] | None = None
     """Transmit and receive error counter of the controller. None if unknown."""

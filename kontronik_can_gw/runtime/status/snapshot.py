@@ -162,6 +162,7 @@ def _can(can: CanFacts, status: GatewayStatus) -> Document:
         "state": name_in_words(status.can_state.name),
         "open": can.open,
         "stalled": can.stalled,
+        "slow": can.slow,
         "complaint": can.complaint or None,
         "restart_ms": can.restart_ms,
         "error_counters": can.error_counters,
