@@ -24,6 +24,7 @@ import pytest
 from built import there
 from every_value import export_shipped
 
+pytestmark = pytest.mark.usefixtures("c_compiler")
 HERE = Path(__file__).parent
 ALARMS = HERE / "alarms.toml"
 HINTS = HERE / "eva_hints.toml"

@@ -5,11 +5,14 @@ python -m pytest -s tests/proofs/long_proofs.py
 
 from pathlib import Path
 
+import pytest
 from every_value import compare_values
 from scaled_frames import WHOLE_PREFIX
 from test_dbc_proof import ONE_ESC
 from test_every_value import configuration
 from test_small_scope import SYMBOLS_IN_C, prove_in_c
+
+pytestmark = pytest.mark.usefixtures("c_compiler")
 
 
 def test_all_short_streams_give_the_frames_of_brute_force_with_the_whole_prefix(

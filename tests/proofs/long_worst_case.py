@@ -6,10 +6,12 @@ A step of `make release`: python -m pytest -s tests/proofs/long_worst_case.py
 import re
 from pathlib import Path
 
+import pytest
 from built import there
 from every_value import DBC
 from worst_case import COMPILER, Limits, build_image, plan_of, search
 
+pytestmark = pytest.mark.usefixtures("c_compiler")
 CALLS = 10_000_000
 SEARCHED = {
     "one byte": "`kcg_receive` of one byte",

@@ -10,6 +10,7 @@ import pytest
 from every_value import compare_values
 from test_dbc_proof import EVERY_RULE, ONE_ESC
 
+pytestmark = pytest.mark.usefixtures("c_compiler")
 QUIET = EVERY_RULE.replace("[can]", "[can]\nquiet_after_s = 60")
 """Two ESCs, multiplexed messages, a code amid values, messages on change, and quiet mode."""
 PROTECTED = EVERY_RULE.replace("every_rule.dbc", "protected.dbc")
