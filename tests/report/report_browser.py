@@ -10,6 +10,7 @@ import select
 import shutil
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -35,14 +36,20 @@ class Browser:
     of all files that the page loaded.
     """
 
-    def __init__(self, profile: Path) -> None:
+    def __init__(self, profile: Path, options: Sequence[str] = ()) -> None:
         assert PROGRAM is not None, MISSING
         to_browser, self._out = os.pipe()
         self._in, from_browser = os.pipe()
         fds = (to_browser, from_browser)
         # the browser reads from 3 and writes to 4
         command = ["bash", "-c", 'exec 8<&"$0" 9>&"$1"; exec "${@:2}" 3<&8 4>&9', *map(str, fds)]
-        command += [PROGRAM, *OPTIONS.split(), f"--user-data-dir={profile}", "about:blank"]
+        command += [
+            PROGRAM,
+            *OPTIONS.split(),
+            *options,
+            f"--user-data-dir={profile}",
+            "about:blank",
+        ]
         quiet = subprocess.DEVNULL
         self._process = subprocess.Popen(
             command,
