@@ -2,6 +2,7 @@
 # Installs programs of others that tests/vcan/test_foreign_masters.py and tests/dronecan/test_foreign_reader.py use:
 #   canopen     a master in JavaScript, by npm         about 10 s, needs node, npm, make, g++ and python3
 #   dronecan    a reader of DroneCAN in Rust, by cargo   about 20 s, needs cargo and a C linker
+#   axe-core    finds barriers in the live page (tests/live), by npm   about 3 s, needs npm
 #   tshark      Wireshark's decoder, from Debian       about 25 s, needs root or a sudo that asks nothing
 # They go to tests/foreign/.cache, tshark to the system. What is there already is left alone. What cannot be had is
 # named, and the others are installed all the same; the exit code then is 1.
@@ -53,6 +54,21 @@ install_node_canopen() {
     fi
 }
 
+install_axe() {
+    key="$(cksum <"$here/../live/axe/package-lock.json")"
+    [ "$(cat "$cache/axe/installed" 2>/dev/null)" = "$key" ] && return
+    have npm || { lacks "axe-core: no npm:  sudo apt-get install npm"; return; }
+    say "axe-core (npm ci)"
+    rm -rf "$cache/axe"
+    mkdir -p "$cache/axe"
+    cp "$here/../live/axe/package.json" "$here/../live/axe/package-lock.json" "$cache/axe"
+    if quietly npm ci --prefix "$cache/axe" --no-audit --no-fund --loglevel=error; then
+        echo "$key" >"$cache/axe/installed"
+    else
+        lacks "axe-core: npm ci failed"
+    fi
+}
+
 install_tshark() {
     have tshark && return
     if [ "$(id -u)" = 0 ]; then
@@ -71,5 +87,6 @@ install_tshark() {
 
 [ "${1:-}" = masters ] || install_tshark
 install_node_canopen
+install_axe
 install_dronecan_reader
 exit $missing

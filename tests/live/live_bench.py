@@ -1,11 +1,13 @@
 """A live page on a bus that the test feeds, and a connection that can lose everything silently."""
 
+import contextlib
 import http.client
 import queue
 import select
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -110,11 +112,17 @@ class ServedPage:
 
 
 class Line:
-    """A TCP connection to a port that can lose everything without closing: ``is_cut``."""
+    """TCP connections to a port that can lose everything without closing: ``is_cut``.
+
+    With ``delay_s``, all data arrive so much later.
+    """
 
     def __init__(self, port: int) -> None:
         self._port = port
         self.is_cut = False
+        self.delay_s = 0.0
+        self._held: deque[tuple[float, socket.socket, bytes]] = deque()
+        """Data that wait for their time of arrival."""
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
         self._pairs: dict[socket.socket, socket.socket] = {}
@@ -137,6 +145,10 @@ class Line:
                     self._connect(sock.accept()[0])
                 elif sock in self._pairs:
                     self._forward(sock)
+            while self._held and self._held[0][0] <= time.monotonic():
+                _, other, data = self._held.popleft()
+                with contextlib.suppress(OSError):
+                    other.sendall(data)
 
     def _connect(self, client: socket.socket) -> None:
         try:
@@ -152,7 +164,7 @@ class Line:
         try:
             data = sock.recv(1 << 16)
             if data:
-                other.sendall(data)
+                self._held.append((time.monotonic() + self.delay_s, other, data))
                 return
         except OSError:
             pass

@@ -3,13 +3,17 @@
 import json
 import math
 from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
 from live_bench import FedBus, Line, ServedPage, wait_until
+from recordings import capture_bytes
 from report_browser import MISSING, PROGRAM, Browser
 from simulated_bus import Timed, flight, with_errors
 
+from kontronik_can_gw.desk.live.flights import Flights
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.times import SECOND as S
@@ -254,3 +258,140 @@ def test_one_of_eight_escs_fills_the_screen(browser: Browser) -> None:
         browser.run("document.querySelector('#back').click()")
         assert browser.run(cards) == 8
         assert math.isclose(browser.run("live.view().plots.length"), 5)
+
+
+AXE = Path(__file__).parents[1] / "foreign/.cache/axe/node_modules/axe-core/axe.min.js"
+
+
+def barriers(browser: Browser) -> list[str]:
+    """Return the violations that axe-core finds in the page."""
+    browser.run(AXE.read_text(encoding="utf-8") + ";0")
+    found: list[str] = browser.run(
+        """(async () => (await axe.run()).violations.map((each) =>
+          `${each.id}: ${each.nodes.map((node) => node.html).join(' | ')}`))()"""
+    )
+    return found
+
+
+@pytest.mark.skipif(not AXE.exists(), reason="no axe-core: tests/foreign/install.sh")
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("name", ["live", "stale", "limit", "flights"])
+def test_axe_finds_no_barriers(
+    browser: Browser, bus: FedBus, dark: bool, name: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "captures"
+    folder.mkdir()
+    (folder / "flight.kcap").write_bytes(capture_bytes())
+    (folder / "empty.kcap").touch()
+    with ServedPage(bus, None, Flights(folder, 0, tmp_path)) as page:
+        fly(bus, 12, with_errors(OperatingError.UNDERVOLTAGE))
+        if name == "flights":
+            ready = "/Energy/.test(document.querySelector('#flights').textContent)"
+            browser.open(f"{page.url}/flights", 360, 780, dark=dark, phone=True, ready=ready)
+        else:
+            browser.open(page.url, 360, 780, dark=dark, phone=True, ready=READY)
+            browser.run("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+            if name == "limit":
+                browser.run(
+                    """(() => { const input = document.querySelector('#limit-list input');
+                    input.value = -1; input.dispatchEvent(new Event('change')); })()"""
+                )
+            if name == "stale":
+                bus.feed([], 40 * S)  # all values are old and grey
+            wait_for_updates(browser)
+        assert barriers(browser) == []
+        browser.run("localStorage.clear()")
+    browser.open("about:blank", ready="true")
+
+
+def test_all_controls_can_be_reached_by_keyboard(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    fly(bus, 5)
+    browser.open(page.url, ready=READY)
+    reached = set()
+    for _ in range(60):
+        for kind in ("keyDown", "keyUp"):
+            key = {"key": "Tab", "code": "Tab", "windowsVirtualKeyCode": 9}
+            browser.call("Input.dispatchKeyEvent", type=kind, **key)
+        reached.add(browser.run("document.activeElement.outerHTML.slice(0, 60)"))
+    missing = browser.run(
+        """[...document.querySelectorAll('button, a, summary, .plot')]
+        .filter((node) => node.getClientRects().length)
+        .map((node) => node.outerHTML.slice(0, 60))"""
+    )
+    assert set(missing) - reached == set()
+
+
+def test_figures_are_announced_at_most_once_in_ten_seconds(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    fly(bus, 5)
+    browser.open(page.url, ready=READY)
+    browser.run(
+        """globalThis.spoken = [];
+        new MutationObserver(() => spoken.push(performance.now()))
+          .observe(document.querySelector('#spoken'), { childList: true, characterData: true })"""
+    )
+    regions = "[...document.querySelectorAll('[aria-live=polite], [role=alert], [role=status]')]"
+    assert browser.run(f"{regions}.map((node) => node.id)") == ["offline", "spoken"]
+    for second in range(5, 25):
+        bus.feed([(now + second * S, frame) for now, frame in flight(bus.bus, 1)], (second + 1) * S)
+        wait_for_updates(browser)
+    spoken = browser.run("spoken")
+    assert all(after - before >= 9_900 for before, after in pairwise(spoken))
+
+
+def test_the_token_vanishes_from_the_address(browser: Browser, bus: FedBus) -> None:
+    with ServedPage(bus, "a-token") as page:
+        fly(bus, 5)
+        browser.open(page.url, ready="!!document.body")
+        assert "web --address" in browser.run("document.body.textContent")
+        browser.errors.clear()
+        browser.open(f"{page.url}/?token=a-token", ready=READY)
+        assert browser.run("location.href") == f"{page.url}/"
+        assert browser.run("document.cookie") == ""
+        wait_for_updates(browser)
+        browser.open(page.url, ready=READY)
+    browser.open("about:blank", ready="true")
+
+
+def test_a_late_page_is_grey_although_messages_arrive(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    """A slow connection delivers old updates at the normal rate."""
+    fly(bus, 5)
+    with Line(page.port) as line:
+        browser.open(line.url, ready=READY)
+        line.delay_s = 2.0
+        is_stale = "document.body.classList.contains('stale')"
+        wait_until(lambda: browser.run(is_stale), "a stale page")
+        count = browser.run("live.updates")
+        wait_until(lambda: browser.run("live.updates") > count + 5, "late updates")
+        assert browser.run(is_stale)
+    browser.open("about:blank", ready="true")
+
+
+def test_a_report_opens_when_it_is_made(browser: Browser, bus: FedBus, tmp_path: Path) -> None:
+    folder = tmp_path / "captures"
+    folder.mkdir()
+    (folder / "flight.kcap").write_bytes(capture_bytes())
+    with ServedPage(bus, None, Flights(folder, 0, tmp_path)) as page:
+        ready = "document.querySelectorAll('.flight button').length > 0"
+        browser.open(f"{page.url}/flights", 360, 780, phone=True, ready=ready)
+        browser.run("document.querySelector('.flight button').click()")
+        is_report = "location.pathname.endsWith('/report') && 'flight' in window"
+        wait_until(lambda: browser.run(is_report), "the report", 60)
+        assert browser.run("flight.data.plots.length") > 3
+        assert browser.errors == []
+        for width in (360, 768, 1440):
+            browser.open(f"{page.url}/flights", width, 780, phone=width == 360, ready=ready)
+            assert browser.run("document.documentElement.scrollWidth") == width
+    browser.open("about:blank", ready="true")
+
+
+def test_the_flights_page_says_what_is_wrong(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    browser.open(f"{page.url}/flights", ready="!/reading/.test(document.body.textContent)")
+    assert "record.directory" in browser.run("document.querySelector('#problem').textContent")

@@ -3,7 +3,7 @@
 // of all figures. Figures are shown as valid only while updates arrive: see `watch`.
 (() => {
   const FROZEN_MS = 1000; // after this time without a message no figure is shown as valid
-  const RETRY_MS = 3000;
+  const RETRY_MS = 5000;
   const DRIFT = 0.0005;
   const SPEAK_MS = 10000;
   const COMMAND = { headers: { "X-Kontronik-Page": "1" }, cache: "no-store" };
@@ -13,7 +13,7 @@
   let source = null;
   let heard = performance.now(); // when the server sent the newest update
   let heardWall = Date.now(); // the same by a clock that goes on while a phone sleeps
-  let offset = Infinity; // least difference of this device's time and the server's, in ms
+  let offset = null; // difference of this device's time and the server's, in ms
   let tried = performance.now();
   let spoken = 0;
   let refused = "";
@@ -30,7 +30,7 @@
 
   function connect() {
     source?.close();
-    offset = Infinity;
+    offset = null;
     tried = performance.now();
     source = new EventSource("/events");
     source.addEventListener("layout", (event) => receive(() => setLayout(event.data)));
@@ -49,11 +49,11 @@
     watch();
   }
 
-  // On a slow connection updates are old when they arrive. Their age is the time by which the difference
-  // of both clocks exceeds its least value, which grows a little because clocks drift.
+  // On a slow connection updates are old when they arrive. The first one was sent after this page had
+  // asked for it, which limits the difference of both clocks. DRIFT is how fast they may drift apart.
   function setHeard(sent) {
     const now = performance.now();
-    offset = Math.min(now - sent, offset + (now - heard) * DRIFT);
+    offset = Math.min(now - sent, offset === null ? tried - sent : offset + (now - heard) * DRIFT);
     heard = sent + offset;
     heardWall = Date.now() - (now - heard);
   }
