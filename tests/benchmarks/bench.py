@@ -18,6 +18,7 @@ sys.path.insert(0, str(ROOT))
 import busy  # noqa: E402
 import live  # noqa: E402
 import offline  # noqa: E402
+import page  # noqa: E402
 from programs import Context, Figure, LeftOut  # noqa: E402
 
 BENCHMARKS = {
@@ -34,6 +35,7 @@ BENCHMARKS = {
     "quiet": live.quiet,
     "start": live.start,
     "memory": live.memory,
+    "web": page.web,
 }
 FOLDER = ROOT / "build" / "bench"
 """Folder of compiled programs and of temporary files. It is kept for the next run."""

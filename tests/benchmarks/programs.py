@@ -192,7 +192,7 @@ def cpu_ns(pid: int) -> int:
     return total
 
 
-def _rss_mb(pid: int) -> float:
+def rss_mb(pid: int) -> float:
     status = Path(f"/proc/{pid}/status").read_text()
     found = re.search(r"^VmRSS:\s+(\d+) kB$", status, re.MULTILINE)
     assert found
@@ -256,7 +256,7 @@ def once(
         took = time.monotonic_ns() - since
         if not used:
             raise LeftOut("this kernel counts CPU time by ticks, too coarse to compare")
-        rss = _rss_mb(gateway.pid)
+        rss = rss_mb(gateway.pid)
         measured = Measured(used / 1000 / frames, used / took, rss, heard(True))
     delay = measured.delay
     say(

@@ -26,12 +26,13 @@ class BusSocket(socket.socket):
         family: int = -1,
         kind: int = -1,
         *further: Any,
+        **named: Any,
     ) -> None:
         self.is_bus = family == socket.AF_CAN
         if self.is_bus:
             super().__init__(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         else:
-            super().__init__(family, kind, *further)
+            super().__init__(family, kind, *further, **named)
 
     def bind(self, address: Any, /) -> None:
         if self.is_bus:
