@@ -26,7 +26,7 @@ help:
 	@echo 'make golden    record the golden set again and print the changes'
 	@echo '               (ARGS="--check" ARGS="flights/v4")'
 	@echo 'make docs      write docs/reference from the sources'
-	@echo 'make pictures  draw docs/pictures: live screen and report   (ARGS=FOLDER: in all sizes)'
+	@echo 'make pictures  draw docs/pictures: live screen and page, report  (ARGS=FOLDER: in all sizes)'
 	@echo 'make wheels    build and check wheels with the core in C for x86-64, arm64 and armv7'
 	@echo '               (ARGS=FOLDER)'
 	@echo 'make deb       build Debian packages with all libraries for amd64, arm64 and armhf'
@@ -92,7 +92,7 @@ docs:
 
 pictures:
 	@tests/bootstrap.sh pictures
-	@PYTHONPATH=tests/cli:tests/report .venv/bin/python tests/readme/pictures.py $(ARGS)
+	@PYTHONPATH=tests/cli:tests/report:tests/live:tests/recordings:tests/capture .venv/bin/python tests/readme/pictures.py $(ARGS)
 
 wheels:
 	@tests/bootstrap.sh wheels

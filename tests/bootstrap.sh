@@ -274,7 +274,7 @@ install_cross_compilers() {
 [ -x "$venv" ] && "$venv" -c "$new_enough" 2>/dev/null || make_venv
 export PATH="$PWD/.venv/bin:$PATH"
 case $what in
-    demo) install_project demo . ;;
+    demo) install_project demo '.[web]' ;;
     lint) install_project test '.[test]' ;;
     test) install_compiler; install_project test '.[test]'; install_vcan; install_small_tools; install_cpp ;;
     test-all)

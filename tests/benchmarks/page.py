@@ -1,4 +1,4 @@
-"""The live page: latency in a real browser, first paint, and the cost beside a gateway."""
+"""Latency of the page of `web` in a real browser, its first paint, and its cost."""
 
 import random
 import re
@@ -160,7 +160,7 @@ def _latencies(steps: list[tuple[float, int]], shown: list[list[float]]) -> list
 
 
 def web(context: Context) -> list[Figure]:
-    """The live page: latency in a browser, first paint, CPU and memory with 5 clients."""
+    """Page of `web`: latency in a browser, first paint, CPU and memory with 5 clients."""
     if PROGRAM is None:
         raise LeftOut(MISSING)
     is_stopped = threading.Event()
@@ -211,7 +211,7 @@ def _share(values: list[float], share: float) -> float:
 def _beside(context: Context) -> list[Figure]:
     """Return the gateway's figures beside the page, compared with those without it, by turns.
 
-    The page has a bus of its own, so this is the effect of its process on the machine.
+    Both have separate buses, so this is the effect of the page's process on the machine.
     """
     alone = []
     beside = []

@@ -1,4 +1,4 @@
-"""A live page on a bus that the test feeds, and a connection that can lose everything silently."""
+"""A served page on a bus that the test feeds, and connections that can lose all data."""
 
 import contextlib
 import http.client
@@ -52,7 +52,7 @@ class FedBus(Source):
 
 
 class ServedPage:
-    """The live page of a source. ``stop`` and ``start`` restart its server at the same port."""
+    """The served page of a source. ``stop`` and ``start`` restart its server at the same port."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""The content of the live page equals the decoded frames, also while they are missing."""
+"""The content of the page equals the decoded frames, also while they are missing."""
 
 import json
 from typing import Any
@@ -73,8 +73,9 @@ def test_alarms_have_remedy_begin_and_end_and_the_newest_is_first() -> None:
     assert voltage["note"] == "its end is not known"
     assert -4 < voltage["to"] < -2
     assert voltage["from"] < -9
-    link, _ = update_of(content, 12 * S)["alarms"]  # the gateway is silent
-    assert link["to"] == 0
+    update_of(content, 14 * S)  # the gateway is silent
+    link, _ = update_of(content, 15 * S)["alarms"]
+    assert link["to"] == -1
     assert link["note"] == "its end is not known"
 
 
@@ -103,7 +104,16 @@ def test_seconds_without_a_call_become_gaps() -> None:
     steps = [json.loads(step) for step in content.steps(6 * S)]
     assert len(steps) == 4
     assert all(value is None for step in steps[:-1] for value in step)
-    assert len(content.steps(10_000 * S)) == STEPS + 1
+    assert len(content.steps(10_000 * S)) == STEPS
+
+
+def test_a_recording_that_is_played_fast_has_no_gaps() -> None:
+    content = Content(FedBus(["esc1"]))
+    for now, frame in flight(layout_of(["esc1"]), 20):
+        content.take(frame, now)
+    steps = [json.loads(step) for step in content.steps(20 * S)]
+    assert len(steps) == 20
+    assert all(None not in step for step in steps[1:])
 
 
 @pytest.mark.parametrize("count", [1, 8])

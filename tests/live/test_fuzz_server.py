@@ -1,4 +1,4 @@
-"""Damaged requests, slow clients and oversized everything. The page of a good client goes on."""
+"""Damaged requests, slow clients and oversized requests do not disturb a good client."""
 
 import json
 import os
@@ -48,7 +48,7 @@ PARTS = (
 
 
 class Served(LoggedProcess):
-    """``web`` of a recording, in a process of its own."""
+    """A separate process of ``web`` with a recording."""
 
     def __init__(self, folder: Path) -> None:
         log = write_log(folder / "flight.log", flight(layout_of(["esc1"]), 5))

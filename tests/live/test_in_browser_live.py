@@ -1,4 +1,4 @@
-"""The live page in a real browser (headless Chromium), on a bus that the test feeds."""
+"""The page in a real browser (headless Chromium), on a bus that the test feeds."""
 
 import json
 import math

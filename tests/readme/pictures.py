@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from command_line import run
+from live_bench import FedBus, ServedPage
+from recordings import capture_bytes
 from report_browser import MISSING, PROGRAM, Browser
 from rich.console import Console
 from simulated_bus import FLYING, flight, layout_of, write_log
 
+from kontronik_can_gw.desk.live.flights import Flights
 from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.screen import screen
 from kontronik_can_gw.desk.sources import Source
@@ -29,7 +32,20 @@ VIEWS: dict[str, tuple[int, int, Any]] = {
     "dark": (1280, 900, {"dark": True}),
     "phone": (390, 844, {"phone": True}),
 }
-SHOWN = ("monitor_1_80.svg", "monitor_4_80.svg", "report_desktop.png")
+LIVE = (
+    ("live", "/", "!!(globalThis.live && live.steps().length > 200 && live.updates > 3)"),
+    ("flights", "/flights", "/(Wh.*){3}/.test(document.querySelector('#flights').textContent)"),
+)
+"""Name, path and condition of each page of `web`."""
+SHOWN = (
+    "monitor_1_80.svg",
+    "monitor_4_80.svg",
+    "report_desktop.png",
+    "live_phone.png",
+    "live_desktop.png",
+    "flights_phone.png",
+    "flights_desktop.png",
+)
 
 
 def option(first_error_s: float) -> EscOptions:
@@ -84,6 +100,29 @@ def reports(folder: Path) -> None:
                 browser.picture(folder / f"report_{name}.png")
 
 
+def live_pages(folder: Path) -> None:
+    """Draw both pages of `web` for two ESCs, on a phone and on a desktop."""
+    bus = FedBus(("left", "right"))
+    with tempfile.TemporaryDirectory() as scratch:
+        captures = Path(scratch, "captures")
+        captures.mkdir()
+        for day, seed in ((1, 3), (2, 4), (3, 5)):
+            path = captures / f"2026010{day}T100000Z-{seed:06x}-00000.kcap"
+            path.write_bytes(capture_bytes(2, seed, 20))
+        flights = Flights(captures, 0, Path(scratch))
+        with (
+            ServedPage(bus, None, flights) as page,
+            Browser(Path(scratch, "profile")) as browser,
+        ):
+            frames = flight(bus.bus, 290, [option(270)])
+            bus.feed([(now, frame) for now, frame in frames if now < 285 * SECOND_NS])
+            for name, (width, height) in {"phone": (390, 800), "desktop": (1120, 660)}.items():
+                for title, place, ready in LIVE:
+                    browser.open(page.url + place, width, height, ready=ready)
+                    browser.settle()
+                    browser.picture(folder / f"{title}_{name}.png")
+
+
 def main(folder: Path) -> None:
     if PROGRAM is None:
         sys.exit(MISSING)
@@ -91,6 +130,7 @@ def main(folder: Path) -> None:
         made = Path(scratch)
         monitors(made)
         reports(made)
+        live_pages(made)
         folder.mkdir(parents=True, exist_ok=True)
         for path in sorted(made.iterdir()):
             if folder != FOLDER or path.name in SHOWN:

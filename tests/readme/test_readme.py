@@ -133,7 +133,7 @@ def test_pictures_can_be_made_again(tmp_path: Path) -> None:
     main(tmp_path)
     made = {path.name for path in tmp_path.iterdir()}
     assert made > set(SHOWN)
-    assert len(made) == 4 + len(VIEWS)
+    assert len(made) == 8 + len(VIEWS)
 
 
 # --- examples

@@ -23,7 +23,7 @@ Start = Callable[..., GatewayProcess]
 
 
 class Heard:
-    """The updates that the server of ``web`` sends, received by a client of its own."""
+    """Receives the updates of the server, as a further client."""
 
     def __init__(self, url: str) -> None:
         self.layout: Any = None

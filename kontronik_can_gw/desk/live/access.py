@@ -1,4 +1,4 @@
-"""Decides which requests the live page answers, and adds security headers to all answers.
+"""Decides which requests are answered, and adds security headers to all answers.
 
 1. Only GET and HEAD.
 2. The Host header is a numeric address or a name of this machine, so that a page of another site
@@ -122,7 +122,7 @@ def is_command(headers: Headers) -> bool:
 
 
 def own_names() -> list[str]:
-    """Return the names by which a browser may call this machine."""
+    """Return this machine's names for browsers."""
     name = socket.gethostname()
     return ["localhost", name, f"{name.partition('.')[0]}.local"]
 

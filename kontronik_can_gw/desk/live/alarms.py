@@ -6,10 +6,16 @@ from typing import Any
 
 from kontronik_can_gw.desk.member import Alarm
 from kontronik_can_gw.desk.report.events import EventKind, FlightEvent
-from kontronik_can_gw.times import SECOND
+from kontronik_can_gw.times import MS, SECOND
 
 _KEPT = 100
 """Number of ended alarms that are kept."""
+_CONFIRMED_NS = 300 * MS
+"""An alarm has ended after this time.
+
+When telemetry is lost, the messages of an ESC report it one after the other. In between, error bits
+seem to be off.
+"""
 _LOST = "its end is not known"
 
 
@@ -19,17 +25,23 @@ class AlarmLog:
     def __init__(self) -> None:
         self._open: dict[tuple[int, str], FlightEvent] = {}
         """The present alarms by ESC and name."""
+        self._missing: dict[tuple[int, str], int] = {}
+        """Since when a present alarm was no longer reported."""
         self._ended: deque[FlightEvent] = deque(maxlen=_KEPT)
 
-    def update(
-        self, esc: int, alarms: Iterable[Alarm], unknown: Container[EventKind], now: int
-    ) -> None:
-        """Set the present alarms of an ESC. ``unknown``: kinds that are not available now."""
+    def update(self, esc: int, alarms: Iterable[Alarm], known: Container[str], now: int) -> None:
+        """Set the present alarms of an ESC. ``known``: names whose state is known."""
         present = {(esc, alarm.text): alarm for alarm in alarms}
-        for key in [key for key in self._open if key[0] == esc and key not in present]:
+        for key in [key for key in self._open if key[0] == esc]:
+            if key in present:
+                self._missing.pop(key, None)
+                continue
+            since = self._missing.setdefault(key, now)
+            if now - since < _CONFIRMED_NS:
+                continue
             event = self._open.pop(key)
-            event.end_ns = now
-            if event.kind in unknown:
+            event.end_ns = self._missing.pop(key)
+            if key[1] not in known:
                 event.note = _LOST
             self._ended.append(event)
         for key, alarm in present.items():

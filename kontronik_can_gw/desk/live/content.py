@@ -1,10 +1,11 @@
-"""The content of the live page: figures, alarms and plots, as JSON for browsers.
+"""Makes JSON for browsers from CAN frames: figures, alarms and plots.
 
 There are three kinds of messages. ``layout`` has everything that does not change. ``update`` has
 the present figures and alarms. A ``step`` has the extremes of one second of all plotted lines.
 """
 
 import json
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,7 +14,6 @@ from kontronik_can_gw.desk.live.alarms import AlarmLog
 from kontronik_can_gw.desk.member import alarms_of
 from kontronik_can_gw.desk.monitor.model import QUANTITIES, Esc, Monitor, Quantity, Track
 from kontronik_can_gw.desk.monitor.notices import link_of, notices, trouble_of
-from kontronik_can_gw.desk.report.events import EventKind
 from kontronik_can_gw.desk.report.quantities import PLOTS
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.desk.words import words
@@ -24,7 +24,7 @@ from kontronik_can_gw.times import SECOND
 STEPS = 300
 """Number of steps, one a second, that the plots show."""
 _SILENT_NS = SECOND
-"""After this time without a frame the page says that no gateway is heard."""
+"""After this time without a frame the page reports that no gateway is heard."""
 _LARGE = (
     "motor_speed",
     "output_speed",
@@ -36,7 +36,7 @@ _LARGE = (
     "power_stage_temperature",
     "bec_temperature",
 )
-"""The values in large figures. Of the speeds only the first one that the DBC has."""
+"""The values in large figures. The first speed in the DBC replaces all speeds."""
 _PLOTTED = ("battery_voltage", "current", "power", "speed", "temperature")
 """Keys of the report's plots that the page has."""
 _LEFT_OUT = ("motor_current", "peak_current")
@@ -84,7 +84,7 @@ class StepTrack(Track):
 
 
 class Content:
-    """The data of the live page. Fed with frames and time by one thread."""
+    """The page's data. One thread passes frames and time."""
 
     def __init__(self, source: Source, disk: Callable[[], str] = str) -> None:
         """``disk`` returns a line about the disk of the captures if its space is short, or ""."""
@@ -92,6 +92,8 @@ class Content:
         self._disk = disk
         self.monitor = Monitor(source.bus, StepTrack)
         self._alarms = AlarmLog()
+        self._ended: deque[str] = deque(maxlen=STEPS)
+        """Steps that have ended and were not taken yet."""
         self._step_ns: int | None = None
         """Begin of the present step."""
         escs = self.monitor.escs
@@ -139,27 +141,31 @@ class Content:
 
     def take(self, frame: CanFrame, now: int) -> None:
         """Evaluate a frame that was received at ``now``."""
+        self._end_steps(now)  # a recording may be played much faster than steps are taken
         self.monitor.take(frame, now)
 
     def steps(self, now: int) -> list[str]:
-        """Set the time, and return the steps that have ended. Usually one or none."""
+        """Set the time, and return the steps that have ended since the last call."""
         now = self.monitor.advance(now)
         for index, esc in enumerate(self.monitor.escs):
             flags = list(esc.active)
             trouble = trouble_of(esc)
             if trouble is not None:
                 flags.insert(0, trouble)
-            unknown: list[EventKind] = []
-            if all(esc.flags(word) is None for word in esc.protocol.errors):
-                unknown.append("error")
-            if esc.link is None:
-                unknown.append("link")
-            self._alarms.update(index, alarms_of(flags), unknown, now)
+            self._alarms.update(index, alarms_of(flags), _known_alarms(esc), now)
+        self._end_steps(now)
+        ended = list(self._ended)
+        self._ended.clear()
+        return ended
+
+    def _end_steps(self, now: int) -> None:
+        """Add the steps that have ended by ``now``. Those without any call are gaps."""
         if self._step_ns is None:
             self._step_ns = now
         count = (now - self._step_ns) // SECOND
-        if not count:
-            return []
+        if count < 1:
+            return
+        self.monitor.advance(now)
         self._step_ns += count * SECOND
         values: list[float | None] = []
         for esc, quantity in self._lines:
@@ -167,8 +173,9 @@ class Content:
             assert isinstance(track, StepTrack)
             for value in track.take_step(esc.number(quantity.source)):
                 values.append(None if value is None else round(value, quantity.digits + 1))
-        missed = min(count - 1, STEPS)
-        return [_json([None] * len(values))] * missed + [_json(values)]
+        if count > 1:
+            self._ended.extend([_json([None] * len(values))] * min(count - 1, STEPS))
+        self._ended.append(_json(values))
 
     def restart_extremes(self) -> None:
         """Let minimum and maximum of all values begin again."""
@@ -210,7 +217,7 @@ class Content:
     def update(self, now: int, sent_s: float) -> str:
         """Return the present figures and alarms, and the state of gateway and bus.
 
-        ``sent_s`` is the time on a clock that always runs, by which a page finds late updates.
+        ``sent_s`` is a monotonic time, with which a page detects late updates.
         """
         monitor = self.monitor
         told = [(kind.value, text) for text, kind in notices(monitor, self.source)]
@@ -287,6 +294,17 @@ class Content:
         age_s = round((now - track.last_ns) / SECOND, 1)
         low = _round(track.low, digits)
         return round(track.last, digits), age_s, low, _round(track.high, digits), ""
+
+
+def _known_alarms(esc: Esc) -> set[str]:
+    """Return the names of the alarms whose present state is known."""
+    known = set()
+    if esc.link is not None:
+        known.add("link")
+    for word, bits in esc.protocol.errors.items():
+        if esc.flags(word) is not None:
+            known |= {bit.text for bit in bits}
+    return known
 
 
 def _has(quantity: Quantity, escs: tuple[Esc, ...]) -> bool:

@@ -212,7 +212,7 @@ class Flights:
     # --- list
 
     def _scan(self) -> str:
-        """Read the folder. Return a line about what is wrong with it, or ""."""
+        """Read the folder. Return a line about its fault, or ""."""
         if self._folder is None:
             return (
                 "There is no folder of captures. Set record.directory in the configuration, or "
@@ -383,7 +383,7 @@ class Flights:
 
 
 def _restrict(pid: int) -> None:
-    """Limit a child process's memory and priority, as far as the system permits."""
+    """Limit a child process's memory and priority. Ignores refusals of the system."""
     with contextlib.suppress(OSError, ValueError):
         resource.prlimit(pid, resource.RLIMIT_DATA, (_LIMIT_BYTES, _LIMIT_BYTES))
         resource.prlimit(pid, resource.RLIMIT_CPU, (_LIMIT_S, _LIMIT_S))

@@ -1,4 +1,4 @@
-"""Serves the live page: uvicorn speaks HTTP, Starlette finds the answer, server-sent events.
+"""Serves the page with uvicorn and Starlette, and its data as server-sent events.
 
 One thread receives frames and makes the content. The event loop of the server sends the newest
 content to all clients. A client that is too slow gets fewer updates and delays no other.
@@ -39,7 +39,7 @@ _MAX_CONNECTIONS = 80
 _REQUEST_S = 10.0
 """Longest time until a connection has sent its first whole request."""
 _STALLED_S = 20.0
-"""Longest time in which a client may accept no data."""
+"""A client that accepts no data for this time is disconnected."""
 _UNSENT = 16 * 1024
 """Number of bytes that may wait to be sent to one client."""
 _MAX_HEAD = 16 * 1024
@@ -100,7 +100,7 @@ class Hub:
         self._is_reset.set()
 
     def attach(self) -> None:
-        """Use the running event loop from now on."""
+        """Publish to the clients of the running event loop."""
         self._loop = asyncio.get_running_loop()
 
     def close(self) -> None:
@@ -164,7 +164,7 @@ def _files() -> dict[str, tuple[bytes, str]]:
 
 
 def application(hub: Hub, flights: Flights) -> Starlette:
-    """Return the application with the live page and the flights."""
+    """Return the application with both pages."""
     files = _files()
 
     def static(name: str) -> Response:
@@ -283,7 +283,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 class LiveServer:
-    """The live page of one source.
+    """The server of one source.
 
     ``serve`` runs until ``stop`` is called, which another thread or a signal handler may do.
     """

@@ -1,4 +1,4 @@
-"""Writes the numbers of one flight for the list of flights, in a process of its own.
+"""Writes the numbers of one flight, for the list of flights.
 
 python -m kontronik_can_gw.desk.live.summary CAPTURE OUTPUT
 """
