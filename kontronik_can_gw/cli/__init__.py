@@ -44,7 +44,7 @@ COMMANDS = {
     "dbc": "write the DBC for several ESCs or for a configuration",
     "eds": "write the EDS, or the DCF of a CANopen node",
     "monitor": "show a live screen of the ESCs, from the CAN bus or a recording",
-    "web": "serve a live page of the ESCs for phones, and the recorded flights",
+    "web": "serve a page of the ESCs for phones, and the recorded flights",
     "convert": "convert recordings and CAN logs to tables or to other log formats",
     "report": "write an HTML page about a recording: summary, plots, events",
     "decode": "decode recorded UART bytes to JSON lines or CSV",

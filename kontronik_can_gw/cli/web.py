@@ -1,4 +1,4 @@
-"""``web``: serves a live page of the ESCs for phones and desktops, and the flights.
+"""``web``: serves a page of the ESCs for phones and desktops, and the flights.
 
 It only reads the bus and the folder of captures. It never sends on CAN.
 """
@@ -69,7 +69,7 @@ SOURCE is that of monitor: a CAN interface, or a recording, which is played at
 its own speed. Without SOURCE the interface is the one in the configuration, or
 can0.
 
-The page shows the ESCs live. /flights lists the recordings in the folder of
+The page shows the ESCs now. /flights lists the recordings in the folder of
 captures, with reports and downloads. It is for this machine only, unless
 --listen names another address. Then a browser needs the token in the address
 that is printed, also as a QR code. The token is stored in the cache folder and
