@@ -104,11 +104,10 @@ def main(args: argparse.Namespace) -> int:
         cache = access.cache_folder(args.cache)
         address = access.Address.stored(cache, host, sock.getsockname()[1], is_open)
         flights = Flights(*_captures_of(args, source), cache)
-        hub = server.Hub(Content(source, lambda: flights.disk))
+        hub = server.Hub(Content(source, flights.disk))
         page = server.LiveServer(hub, sock, None if is_open else address.token, flights)
-        thread = threading.Thread(
-            target=server.feed, args=(source, hub, stopped.is_set), daemon=True
-        )
+        arguments = (source, hub, stopped.is_set)
+        thread = threading.Thread(target=server.feed, args=arguments, daemon=True)
         with stopping_on_signals(page.stop):
             _announce(source, address)
             thread.start()

@@ -30,7 +30,7 @@ def guarded() -> Iterator[ServedPage]:
 
 
 def test_pages_and_files_are_served_with_protecting_headers(page: ServedPage) -> None:
-    for path in ("/", "/static/live.js", "/static/plots.js", "/static/uPlot.iife.min.js"):
+    for path in ("/", "/static/live.js", "/look/plots.js", "/look/vendor/uPlot.iife.min.js"):
         status, headers, body = page.get(path)
         assert status == 200
         assert body
@@ -43,7 +43,7 @@ def test_pages_and_files_are_served_with_protecting_headers(page: ServedPage) ->
 
 
 def test_no_file_of_the_page_loads_anything_from_elsewhere(page: ServedPage) -> None:
-    for path in ("/", "/static/live.js", "/static/live.css", "/static/plots.js"):
+    for path in ("/", "/static/live.js", "/static/live.css", "/look/plots.js"):
         text = page.get(path)[2].decode().replace("http://www.w3.org/2000/svg", "")
         assert "//" not in re.sub(r"(?m)(^|\s)//\s.*$", "", text), path
 
@@ -74,7 +74,7 @@ def test_names_in_the_host_header_are_checked(page: ServedPage, host: str, statu
 
 
 def test_paths_outside_of_the_list_are_not_found(page: ServedPage) -> None:
-    for path in ("/static/../server.py", "/static/%2e%2e%2fserver.py", "/static/", "/etc/passwd"):
+    for path in ("/static/../server.py", "/static/%2e%2e%2fserver.py", "/look/..%2flive", "/etc"):
         status, _, body = page.get(path)
         assert status == 404
         assert b"/" not in body

@@ -7,8 +7,8 @@ import pytest
 from live_bench import FedBus
 from simulated_bus import FLYING, flight, layout_of, with_errors
 
-from kontronik_can_gw.desk.live.content import STEPS, Content, StepTrack
-from kontronik_can_gw.desk.monitor.model import Monitor
+from kontronik_can_gw.desk.live.content import STEPS, Content
+from kontronik_can_gw.desk.monitor.model import Monitor, Track
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.times import SECOND as S
@@ -83,12 +83,12 @@ def test_reset_restarts_the_extremes_and_keeps_the_plots() -> None:
     content = content_of(["esc1"], 20, options=[EscOptions(profile=FLYING)])
     high = update_of(content, 20 * S)["escs"][0]["values"][0][3]
     assert high > 1000
-    content.restart_extremes()
+    content.monitor.restart_extremes()
     assert update_of(content, 20 * S)["escs"][0]["values"][0][2:4] == [None, None]
 
 
 def test_a_step_has_the_extremes_of_its_second_in_their_order() -> None:
-    track = StepTrack()
+    track = Track()
     for value in (5.0, 9.0, 2.0):
         track.add(value, 0)
     assert track.take_step(2.0) == (9.0, 2.0)

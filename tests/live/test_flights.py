@@ -247,4 +247,4 @@ def test_a_child_process_that_takes_too_long_is_ended(
 def test_a_short_disk_is_told_on_the_page(folder: Path, tmp_path: Path) -> None:
     flights = Flights(folder, 1 << 60, tmp_path)
     with ServedPage(FedBus(["esc1"]), None, flights):
-        wait_until(lambda: "MB free" in flights.disk, "the line")
+        wait_until(lambda: "MB free" in flights.disk(), "the line")

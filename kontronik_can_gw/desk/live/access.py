@@ -23,14 +23,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import HTTPConnection
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection, Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.files.disk import write_new
 
-COMMAND_HEADER = "X-Kontronik-Page"
+_COMMAND_HEADER = "X-Kontronik-Page"
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -116,9 +117,14 @@ def _is_same(given: str, token: str) -> bool:
     return hmac.compare_digest(given.encode(errors="replace"), token.encode())
 
 
-def is_command(headers: Headers) -> bool:
-    """Return True for a request that this page's script has sent, and no page of another site."""
-    return COMMAND_HEADER in headers
+def is_command(request: Request) -> bool:
+    """Return True for a GET request that changes something, False for a HEAD request.
+
+    Raises HTTPException if the page's own script has not sent it.
+    """
+    if _COMMAND_HEADER not in request.headers:
+        raise HTTPException(403)
+    return request.method == "GET"
 
 
 def own_names() -> list[str]:

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Container, Iterable
+from dataclasses import asdict
 from typing import Any
 
 from kontronik_can_gw.desk.member import Alarm
@@ -59,16 +60,12 @@ class AlarmLog:
         )
         found = []
         for event in events:
-            end_ns = event.end_ns
-            found.append(
-                {
-                    "esc": event.esc,
-                    "text": event.text,
-                    "severity": event.severity,
-                    "remedy": event.remedy,
-                    "note": event.note,
-                    "from": round((event.begin_ns - now) / SECOND, 1),
-                    "to": None if end_ns is None else round((end_ns - now) / SECOND, 1),
-                }
-            )
+            content = asdict(event)
+            content["from"] = _seconds(event.begin_ns - now)
+            content["to"] = None if event.end_ns is None else _seconds(event.end_ns - now)
+            found.append(content)
         return found
+
+
+def _seconds(time_ns: int) -> float:
+    return round(time_ns / SECOND, 1)

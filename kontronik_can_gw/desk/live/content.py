@@ -6,15 +6,15 @@ the present figures and alarms. A ``step`` has the extremes of one second of all
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from kontronik_can_gw import __version__
 from kontronik_can_gw.desk.live.alarms import AlarmLog
 from kontronik_can_gw.desk.member import alarms_of
-from kontronik_can_gw.desk.monitor.model import QUANTITIES, Esc, Monitor, Quantity, Track
+from kontronik_can_gw.desk.monitor.model import QUANTITIES, Esc, Monitor, Quantity
 from kontronik_can_gw.desk.monitor.notices import link_of, notices, trouble_of
-from kontronik_can_gw.desk.report.quantities import PLOTS
+from kontronik_can_gw.desk.report.quantities import PLOTS, Plot
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.desk.words import words
 from kontronik_can_gw.esc.value_names import normalize
@@ -37,50 +37,12 @@ _LARGE = (
     "bec_temperature",
 )
 """The values in large figures. The first speed in the DBC replaces all speeds."""
-_PLOTTED = ("battery_voltage", "current", "power", "speed", "temperature")
-"""Keys of the report's plots that the page has."""
-_LEFT_OUT = ("motor_current", "peak_current")
-"""Lines of these plots that the page leaves out, because they would hide the first one."""
+_PLOTTED = {"battery_voltage": 1, "current": 1, "power": 1, "speed": 1, "temperature": 2}
+"""Keys of the report's plots that the page has, and the number of their lines.
+
+Further lines would hide the first one.
+"""
 _MARKS = {"": "", "!": "warning", "!!": "error"}
-
-
-class StepTrack(Track):
-    """A track that also has the extremes since the last step of the plots."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._step_low: float | None = None
-        self._step_high: float | None = None
-        self._is_rising = True
-        """True if the highest value of the step came after the lowest one."""
-
-    def add(self, value: float, now: int) -> None:
-        super().add(value, now)
-        if self._step_low is None or value < self._step_low:
-            self._step_low = value
-            self._is_rising = False
-        if self._step_high is None or value > self._step_high:
-            self._step_high = value
-            self._is_rising = True
-
-    def take_step(self, value: float | None) -> tuple[float | None, float | None]:
-        """Return the extremes since the last call in the order of their times.
-
-        Without a new value they are the present ``value``.
-        """
-        first, second = self._step_low, self._step_high
-        if first is None:
-            first = second = value
-        elif not self._is_rising:
-            first, second = second, first
-        self._step_low = None
-        self._step_high = None
-        return first, second
-
-    def restart_extremes(self) -> None:
-        """Let minimum and maximum begin again."""
-        self.low = None
-        self.high = None
 
 
 class Content:
@@ -90,54 +52,46 @@ class Content:
         """``disk`` returns a line about the disk of the captures if its space is short, or ""."""
         self.source = source
         self._disk = disk
-        self.monitor = Monitor(source.bus, StepTrack)
+        self.monitor = Monitor(source.bus)
         self._alarms = AlarmLog()
         self._ended: deque[str] = deque(maxlen=STEPS)
         """Steps that have ended and were not taken yet."""
         self._step_ns: int | None = None
         """Begin of the present step."""
-        escs = self.monitor.escs
-        speeds = [each for each in QUANTITIES if each.unit == "1/min" and _has(each, escs)]
-        hidden = {each.source for each in speeds[1:]}
+        known = [
+            each for each in QUANTITIES if any(esc.has(each.source) for esc in self.monitor.escs)
+        ]
+        hidden = [each.source for each in known if each.unit == "1/min"][1:]
         self._large = [source for source in _LARGE if source not in hidden]
-        quantities = [each for each in QUANTITIES if _has(each, escs)]
-        self._quantities = sorted(quantities, key=lambda each: _rank(self._large, each.source))
-        self._plots = list(self._make_plots(hidden))
+        self._quantities = sorted(known, key=lambda each: each.source not in self._large)
+        """The quantities in the DBC, those in large figures first."""
+        self._plots: list[dict[str, Any]] = []
         self._lines: list[tuple[Esc, Quantity]] = []
         """The lines of all plots, in the order of a step's values."""
-        by_source = {quantity.source: quantity for quantity in QUANTITIES}
-        for plot in self._plots:
-            for series in plot["series"]:
-                esc = self.monitor.escs[series["esc"]]
-                self._lines.append((esc, by_source[plot["sources"][series["line"]]]))
-
-    def _make_plots(self, hidden: set[str]) -> Iterator[dict[str, Any]]:
         for plot in PLOTS:
-            if plot.key not in _PLOTTED:
-                continue
-            lines = {}
-            for source, label in plot.lines.items():
-                is_known = any(esc.has(source) for esc in self.monitor.escs)
-                if is_known and source not in hidden and source not in _LEFT_OUT:
-                    lines[source] = label
-            series = []
-            for line, source in enumerate(lines):
-                for esc in self.monitor.escs:
-                    if esc.has(source):
-                        series.append({"esc": esc.index, "line": line, "drawn": True})
-            if not series:
-                continue
-            unit = next(each.unit for each in QUANTITIES if each.source in lines)
-            yield {
-                "key": plot.key,
-                "title": plot.title,
-                "note": "",
-                "unit": unit,
-                "digits": plot.digits,
-                "lines": list(lines.values()),
-                "sources": list(lines),
-                "series": series,
-            }
+            if plot.key in _PLOTTED:
+                lines = [each for each in known if each.source in plot.lines.keys() - hidden]
+                self._add_plot(plot, lines[: _PLOTTED[plot.key]])
+
+    def _add_plot(self, plot: Plot, lines: list[Quantity]) -> None:
+        """Add a plot with a line for each quantity of each ESC."""
+        series = []
+        for line, quantity in enumerate(lines):
+            for esc in self.monitor.escs:
+                if esc.has(quantity.source):
+                    series.append({"esc": esc.index, "line": line})
+                    self._lines.append((esc, quantity))
+        if series:
+            self._plots.append(
+                {
+                    "key": plot.key,
+                    "title": plot.title,
+                    "unit": lines[0].unit,
+                    "digits": plot.digits,
+                    "lines": [plot.lines[quantity.source] for quantity in lines],
+                    "series": series,
+                }
+            )
 
     def take(self, frame: CanFrame, now: int) -> None:
         """Evaluate a frame that was received at ``now``."""
@@ -170,42 +124,28 @@ class Content:
         values: list[float | None] = []
         for esc, quantity in self._lines:
             track = esc.tracks[quantity.source]
-            assert isinstance(track, StepTrack)
             for value in track.take_step(esc.number(quantity.source)):
-                values.append(None if value is None else round(value, quantity.digits + 1))
+                values.append(_round(value, quantity.digits + 1))
         if count > 1:
             self._ended.extend([_json([None] * len(values))] * min(count - 1, STEPS))
         self._ended.append(_json(values))
-
-    def restart_extremes(self) -> None:
-        """Let minimum and maximum of all values begin again."""
-        for esc in self.monitor.escs:
-            for track in esc.tracks.values():
-                assert isinstance(track, StepTrack)
-                track.restart_extremes()
 
     def layout(self) -> str:
         """Return everything that does not change."""
         source = self.source
         quantities = []
         for quantity in self._quantities:
-            quantities.append(
-                {
-                    "source": quantity.source,
-                    "label": quantity.label,
-                    "unit": quantity.unit,
-                    "digits": quantity.digits,
-                    "isLarge": quantity.source in self._large,
-                    "isUpper": quantity.unit != "V",
-                    "has": [esc.has(quantity.source) for esc in self.monitor.escs],
-                }
-            )
+            more = {
+                "unit": quantity.unit,
+                "isLarge": quantity.source in self._large,
+                "isUpper": quantity.unit != "V",
+                "has": [esc.has(quantity.source) for esc in self.monitor.escs],
+            }
+            quantities.append(quantity._asdict() | more)
         return _json(
             {
                 "version": __version__,
                 "name": source.name,
-                "file": self.monitor.file,
-                "kind": "recording" if source.is_file else "bus",
                 "simulation": source.simulation,
                 "escs": [esc.name for esc in self.monitor.escs],
                 "quantities": quantities,
@@ -279,21 +219,23 @@ class Content:
         """
         track = esc.tracks[quantity.source]
         value = esc.number(quantity.source)
-        digits = quantity.digits
+        age_s = None
+        mark = ""
         if value is not None:
             mark = _MARKS[quantity.mark(value)]
-            return (
-                round(value, digits),
-                None,
-                _round(track.low, digits),
-                _round(track.high, digits),
-                mark,
-            )
-        if track.last is None:
+        elif track.last is not None:
+            value = track.last
+            age_s = round((now - track.last_ns) / SECOND, 1)
+        else:
             return None
-        age_s = round((now - track.last_ns) / SECOND, 1)
-        low = _round(track.low, digits)
-        return round(track.last, digits), age_s, low, _round(track.high, digits), ""
+        digits = quantity.digits
+        return (
+            round(value, digits),
+            age_s,
+            _round(track.low, digits),
+            _round(track.high, digits),
+            mark,
+        )
 
 
 def _known_alarms(esc: Esc) -> set[str]:
@@ -305,14 +247,6 @@ def _known_alarms(esc: Esc) -> set[str]:
         if esc.flags(word) is not None:
             known |= {bit.text for bit in bits}
     return known
-
-
-def _has(quantity: Quantity, escs: tuple[Esc, ...]) -> bool:
-    return any(esc.has(quantity.source) for esc in escs)
-
-
-def _rank(order: list[str], source: str) -> int:
-    return order.index(source) if source in order else len(order)
 
 
 def _round(value: float | None, digits: int) -> float | None:

@@ -19,8 +19,9 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from kontronik_can_gw import __version__
@@ -51,7 +52,6 @@ _CACHE_BYTES = 512 << 20
 _POLL_S = 0.5
 _LOOKED_AT_S = 10.0
 """Summaries are made until this time after the last request for the list."""
-_DISK_S = 10.0
 _WRITTEN_S = 300
 """A capture that was not changed for this time is not being written."""
 _NICE = 19
@@ -108,30 +108,22 @@ def recordings_in(folder: Path) -> list[Recording]:
     return sorted(found, key=lambda each: (each.changed_ns, each.name), reverse=True)
 
 
-class Job(NamedTuple):
-    """A file to make."""
-
-    recording: Recording
-    kind: str
-
-
 class Flights:
     """The list of flights, and the worker that makes their files."""
 
     def __init__(
         self, folder: Path | None = None, min_free_bytes: int = 0, cache: Path = Path()
     ) -> None:
-        self.disk = ""
-        """A line about the disk of the captures if its space is short."""
         self._folder = folder
         self._cache = cache / "flights"
         self._min_free_bytes = min_free_bytes
         self._recordings: dict[str, Recording] = {}
-        self._jobs: dict[tuple[str, str], Job] = {}
+        self._jobs: dict[tuple[str, str], Recording] = {}
         """The requested files in their order, by id and kind."""
         self._failed: dict[tuple[str, str], str] = {}
         """Reason why a file could not be made, by key and kind."""
-        self._current: Job | None = None
+        self._current: tuple[Recording, str] | None = None
+        """The recording and the kind of the file that is being made."""
         self._progress = 0.0
         self._process: asyncio.subprocess.Process | None = None
         self._looked_at = float("-inf")
@@ -140,13 +132,12 @@ class Flights:
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         """Make files while the context is open."""
-        tasks = [asyncio.create_task(self._work()), asyncio.create_task(self._watch_disk())]
+        task = asyncio.create_task(self._work())
         try:
             yield
         finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
     def routes(self) -> list[BaseRoute]:
         return [
@@ -160,54 +151,48 @@ class Flights:
 
     async def _list(self, _: Request) -> Response:
         self._looked_at = time.monotonic()
-        problem = await asyncio.to_thread(self._scan)
+        content = await asyncio.to_thread(self._content)
         self._awake.set()
-        kinds = [kind for kind in _COMMANDS if kind != _SUMMARY]
-        if importlib.util.find_spec("pyarrow") is None:
-            kinds.remove("parquet")
-        flights = await asyncio.to_thread(self._described)
-        content = {"problem": problem, "kinds": kinds, "flights": flights}
         return JSONResponse(content)
+
+    def _recording(self, request: Request) -> Recording:
+        """Return the recording of a request. Raises HTTPException if there is none."""
+        recording = self._recordings.get(request.path_params["id"])
+        if recording is None or request.path_params.get("kind", _SUMMARY) not in _COMMANDS:
+            raise HTTPException(404)
+        return recording
 
     async def _request(self, request: Request) -> Response:
         """Order a file. Only the page itself may do it."""
-        if not is_command(request.headers):
-            return PlainTextResponse("Only for the page itself.\n", 403)
-        recording = self._recordings.get(request.path_params["id"])
+        is_wanted = is_command(request)
+        recording = self._recording(request)
         kind = request.path_params["kind"]
-        if recording is None or kind not in _COMMANDS or request.method != "GET":
-            return PlainTextResponse("Not found.\n", 404)
-        if not self._made(recording, kind).exists():
+        if is_wanted and not self._made(recording, kind).exists():
             self._failed.pop((recording.key, kind), None)
-            self._jobs[recording.id, kind] = Job(recording, kind)
+            self._jobs[recording.id, kind] = recording
             self._awake.set()
-            if self._current is not None and self._current.kind == _SUMMARY:
+            if self._current is not None and self._current[1] == _SUMMARY:
                 self._kill()  # it is made again later
         return Response(status_code=202)
 
     async def _file(self, request: Request) -> Response:
-        recording = self._recordings.get(request.path_params["id"])
+        recording = self._recording(request)
         kind = request.path_params["kind"]
-        if recording is None or kind not in _COMMANDS:
-            return PlainTextResponse("Not found.\n", 404)
         path = self._made(recording, kind)
-        name = f"{recording.name}.{_ENDINGS[kind]}"
         if not path.exists():
-            return PlainTextResponse("Not made yet. Ask for it in the list of flights.\n", 404)
+            raise HTTPException(404)
         if kind == "report":
             headers = {"Content-Security-Policy": f"{policy()}; frame-ancestors 'none'"}
             return FileResponse(path, headers=headers)
-        return FileResponse(path, filename=name)
+        return FileResponse(path, filename=f"{recording.name}{path.suffix}")
 
     async def _capture(self, request: Request) -> Response:
-        recording = self._recordings.get(request.path_params["id"])
+        paths = self._recording(request).paths
         part = request.path_params["part"]
-        if recording is None or part >= len(recording.paths):
-            return PlainTextResponse("Not found.\n", 404)
-        path = recording.paths[part]
-        if not path.is_file():
-            return PlainTextResponse("Not found.\n", 404)
-        return FileResponse(path, filename=path.name, media_type="application/octet-stream")
+        if part >= len(paths) or not paths[part].is_file():
+            raise HTTPException(404)
+        media = "application/octet-stream"
+        return FileResponse(paths[part], filename=paths[part].name, media_type=media)
 
     # --- list
 
@@ -226,11 +211,15 @@ class Flights:
         self._recordings = {recording.id: recording for recording in found}
         return ""
 
-    def _described(self) -> list[dict[str, Any]]:
-        described = []
+    def _content(self) -> dict[str, Any]:
+        """Read the folder. Return the list of flights."""
+        problem = self._scan()
+        kinds = [kind for kind in _COMMANDS if kind != _SUMMARY]
+        if importlib.util.find_spec("pyarrow") is None:
+            kinds.remove("parquet")
+        flights = []
         for recording in self._recordings.values():
-            states = {kind: self._state(recording, kind) for kind in _COMMANDS}
-            described.append(
+            flights.append(
                 {
                     "id": recording.id,
                     "name": recording.name,
@@ -238,18 +227,17 @@ class Flights:
                     "parts": len(recording.paths),
                     "isWritten": recording.is_written,
                     "summary": self._summary(recording),
-                    "states": states,
+                    "states": {kind: self._state(recording, kind) for kind in _COMMANDS},
                 }
             )
-        return described
+        return {"problem": problem, "kinds": kinds, "flights": flights}
 
     def _state(self, recording: Recording, kind: str) -> Any:
         """Return "made", "waiting", a progress from 0 to 1, {"failed": reason}, or None."""
         failed = self._failed.get((recording.key, kind))
         if failed is not None:
             return {"failed": failed}
-        job = self._current
-        if job is not None and (job.recording.id, job.kind) == (recording.id, kind):
+        if self._current is not None and self._current == (recording, kind):
             return round(self._progress, 2)
         if (recording.id, kind) in self._jobs:
             return "waiting"
@@ -269,44 +257,38 @@ class Flights:
 
     async def _work(self) -> None:
         while True:
-            job = self._next()
-            if job is None:
+            self._current = self._next()
+            if self._current is None:
                 self._awake.clear()
                 await self._awake.wait()
                 continue
-            self._current = job
+            recording, kind = self._current
             self._progress = 0.0
             try:
-                await self._make(job)
+                await self._make(recording, kind)
             except OSError as error:
-                self._failed[job.recording.key, job.kind] = f"{error.strerror or error}"
-            finally:
-                self._current = None
-                self._process = None
+                self._failed[recording.key, kind] = error.strerror or ""
             await asyncio.to_thread(self._prune)
 
-    def _next(self) -> Job | None:
+    def _next(self) -> tuple[Recording, str] | None:
         """Return the next file to make: a requested one, or a missing summary."""
-        if self._jobs:
-            return self._jobs.pop(next(iter(self._jobs)))
+        for (flight_id, kind), recording in self._jobs.items():
+            del self._jobs[flight_id, kind]
+            return recording, kind
         if time.monotonic() - self._looked_at > _LOOKED_AT_S:
             return None
         for recording in self._recordings.values():
-            has_failed = (recording.key, _SUMMARY) in self._failed
-            if has_failed or self._made(recording, _SUMMARY).exists():
-                continue
-            if not recording.is_written:
-                return Job(recording, _SUMMARY)
+            if self._state(recording, _SUMMARY) is None and not recording.is_written:
+                return recording, _SUMMARY
         return None
 
-    async def _make(self, job: Job) -> None:
-        recording = job.recording
+    async def _make(self, recording: Recording, kind: str) -> None:
         self._cache.mkdir(mode=0o700, parents=True, exist_ok=True)
         source = recording.paths[0].name
         if len(recording.paths) > 1:
             source = f"{recording.name}-"
-        words = {"source": f"./{source}", "output": str(self._made(recording, job.kind))}
-        command = [word.format(**words) for word in _COMMANDS[job.kind]]
+        words = {"source": f"./{source}", "output": str(self._made(recording, kind))}
+        command = [word.format(**words) for word in _COMMANDS[kind]]
         process = await asyncio.create_subprocess_exec(
             sys.executable,
             "-m",
@@ -329,13 +311,10 @@ class Flights:
         finally:
             self._kill()
             _, said = await talk
-        if process.returncode == 0 or (job.kind == _SUMMARY and self._jobs):
+        if process.returncode == 0 or (kind == _SUMMARY and self._jobs):
             return
-        lines = said.decode(errors="replace").strip().splitlines()
-        reason = lines[-1].removeprefix("kontronik-can-gw ")[:300] if lines else ""
-        if process.returncode is not None and process.returncode < 0:
-            reason = "it needed too much memory or time"
-        self._failed[recording.key, job.kind] = reason or "it failed"
+        _, _, reason = said.decode(errors="replace").strip().rpartition("\n")
+        self._failed[recording.key, kind] = reason[:300] or "it needed too much memory or time"
 
     def _kill(self) -> None:
         process = self._process
@@ -360,15 +339,9 @@ class Flights:
                     break
                 path.unlink()
                 total -= size
-        known = keys | {job.recording.key for job in self._jobs.values()}
-        self._failed = {key: text for key, text in self._failed.items() if key[0] in known}
 
-    async def _watch_disk(self) -> None:
-        while True:
-            self.disk = await asyncio.to_thread(self._disk_line)
-            await asyncio.sleep(_DISK_S)
-
-    def _disk_line(self) -> str:
+    def disk(self) -> str:
+        """Return a line about the disk of the captures if its space is short, or ""."""
         if self._folder is None:
             return ""
         try:

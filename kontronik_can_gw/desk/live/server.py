@@ -10,15 +10,17 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import uvicorn
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response, StreamingResponse
-from starlette.routing import BaseRoute, Route
+from starlette.responses import FileResponse, Response, StreamingResponse
+from starlette.routing import BaseRoute, Mount, Route
+from starlette.staticfiles import StaticFiles
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from kontronik_can_gw.desk import look
@@ -45,12 +47,6 @@ _UNSENT = 16 * 1024
 _MAX_HEAD = 16 * 1024
 """Maximum size of the head of a request, in bytes."""
 _PAGES = Path(__file__).parent / "page"
-_TYPES = {
-    ".html": "text/html; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".svg": "image/svg+xml",
-}
 
 
 class Hub:
@@ -80,7 +76,7 @@ class Hub:
         """Publish steps, and an update if it is due. Return the time of the next update."""
         if self._is_reset.is_set():
             self._is_reset.clear()
-            self.content.restart_extremes()
+            self.content.monitor.restart_extremes()
         now = time.monotonic()
         if now < self._due:
             return self._due
@@ -153,54 +149,33 @@ def _event(name: str, text: str) -> str:
 # --- answers
 
 
-def _files() -> dict[str, tuple[bytes, str]]:
-    """Return content and type of all files of the pages, by name."""
-    paths = [*_PAGES.iterdir(), look.HERE / "look.css", look.HERE / "plots.js"]
-    paths += sorted((look.HERE / "vendor").glob("uPlot.*min.*"))
-    found = {}
-    for path in paths:
-        found[path.name] = (path.read_bytes(), _TYPES[path.suffix])
-    return found
-
-
 def application(hub: Hub, flights: Flights) -> Starlette:
     """Return the application with both pages."""
-    files = _files()
-
-    def static(name: str) -> Response:
-        if name not in files:
-            return PlainTextResponse("Not found.\n", 404)
-        content, media = files[name]
-        return Response(content, media_type=media, headers={"Cache-Control": "no-cache"})
 
     async def page(_: Request) -> Response:
-        return static("live.html")
+        return FileResponse(_PAGES / "live.html")
 
     async def list_page(_: Request) -> Response:
-        return static("flights.html")
-
-    async def asset(request: Request) -> Response:
-        return static(request.path_params["name"])
+        return FileResponse(_PAGES / "flights.html")
 
     async def events(request: Request) -> Response:
         headers = {"Content-Type": "text/event-stream"}
         if request.method == "HEAD":
             return Response(headers=headers)
         if hub.clients >= _MAX_PAGES:
-            return PlainTextResponse("Too many pages are open. Close one.\n", 503)
+            raise HTTPException(503)
         return StreamingResponse(hub.stream(), headers=headers)
 
     async def reset(request: Request) -> Response:
-        if not is_command(request.headers):
-            return PlainTextResponse("Only for the page itself.\n", 403)
-        if request.method == "GET":
+        if is_command(request):
             hub.reset()
         return Response(status_code=204)
 
     routes: list[BaseRoute] = [
         Route("/", page),
         Route("/flights", list_page),
-        Route("/static/{name}", asset),
+        Mount("/static", StaticFiles(directory=_PAGES)),
+        Mount("/look", StaticFiles(directory=look.HERE)),
         Route("/events", events),
         Route("/reset", reset),
     ]
@@ -257,12 +232,19 @@ class _Limited(H11Protocol):
             timer.cancel()
 
 
-class Server(uvicorn.Server):
-    """uvicorn, which leaves the signals to the command."""
+class _Server(uvicorn.Server):
+    """uvicorn, which leaves the signals to the command, and ends the streams when it ends."""
 
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield
+    def __init__(self, config: uvicorn.Config, hub: Hub) -> None:
+        super().__init__(config)
+        self._hub = hub
+
+    def capture_signals(self) -> contextlib.AbstractContextManager[None]:  # type: ignore[override]
+        return contextlib.nullcontext()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._hub.close()
+        await super().shutdown(sockets)
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -299,7 +281,7 @@ class LiveServer:
         self._sock = sock
         self._flights = flights
         app = Gate(application(hub, flights), token, sock.getsockname()[1], own_names())
-        self._server = Server(
+        self._server = _Server(
             uvicorn.Config(
                 app,
                 http=_Limited,
@@ -314,7 +296,8 @@ class LiveServer:
                 timeout_keep_alive=30,
                 timeout_graceful_shutdown=1,
                 h11_max_incomplete_event_size=_MAX_HEAD,
-            )
+            ),
+            hub,
         )
 
     def stop(self) -> None:
@@ -327,15 +310,7 @@ class LiveServer:
     async def _serve(self) -> None:
         self._hub.attach()
         async with self._flights.running():
-            watch = asyncio.create_task(self._close_streams())
             await self._server.serve([self._sock])
-            watch.cancel()
-
-    async def _close_streams(self) -> None:
-        """End the streams when the server is to end, because it waits for them."""
-        while not self._server.should_exit:
-            await asyncio.sleep(0.05)
-        self._hub.close()
 
 
 def feed(source: Source, hub: Hub, stopped: Callable[[], bool]) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.recorded import flight_of
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
@@ -29,28 +30,22 @@ def summary_of(capture: Path) -> dict[str, Any]:
         start_ms = None if wall_ns is None else wall_ns // MS
         if start_ms is not None and (is_trusted is False or start_ms < _CLOCK_IS_SET_MS):
             start_ms = None
-        currents = []
-        voltages = []
-        energies = []
-        for esc in flight.escs:
-            if "battery_current" in esc.extremes:
-                currents.append(esc.extremes["battery_current"].value)
-            if "battery_voltage" in esc.extremes:
-                voltages.append(esc.extremes["battery_voltage"].value)
-            if esc.energy_wh is not None:
-                energies.append(esc.energy_wh)
-        errors = [event for event in flight.events if event.severity == "error"]
-        warnings = [event for event in flight.events if event.severity == "warning"]
+        energies = [esc.energy_wh for esc in flight.escs if esc.energy_wh is not None]
+        severities = [event.severity for event in flight.events]
         return {
             "start": start_ms,
             "duration": round((flight.end_ns - flight.start_ns) / SECOND, 1),
-            "current": max(currents, default=None),
-            "voltage": min(voltages, default=None),
+            "current": max(_extremes(flight, "battery_current"), default=None),
+            "voltage": min(_extremes(flight, "battery_voltage"), default=None),
             "energy": round(sum(energies), 2) if energies else None,
-            "errors": len(errors),
-            "warnings": len(warnings),
+            "errors": severities.count("error"),
+            "warnings": severities.count("warning"),
             "damage": len(recording.damage),
         }
+
+
+def _extremes(flight: Flight, source: str) -> list[float]:
+    return [esc.extremes[source].value for esc in flight.escs if source in esc.extremes]
 
 
 def main(capture: str, output: str) -> int:

@@ -4,7 +4,6 @@ All values are read from CAN frames. Pure: no I/O, no clock.
 """
 
 from collections import deque
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.dbc.view import View
@@ -92,6 +91,8 @@ class Track:
         self.last_ns = 0
         """The time at which ``last`` was received."""
         self.history: deque[float | None] = deque(maxlen=HISTORY_S)
+        self._step: tuple[float, float] | None = None
+        """Extremes since the last call of ``take_step``, in the order of their times."""
 
     def add(self, value: float, now: int) -> None:
         self.last = value
@@ -100,6 +101,20 @@ class Track:
             self.low = value
         if self.high is None or value > self.high:
             self.high = value
+        first, second = self._step or (value, value)
+        if value < min(first, second):
+            self._step = (max(first, second), value)
+        elif value > max(first, second) or self._step is None:
+            self._step = (min(first, second), value)
+
+    def take_step(self, value: float | None) -> tuple[float | None, float | None]:
+        """Return the extremes since the last call in the order of their times.
+
+        If no value was added, they are the present ``value``.
+        """
+        step = self._step or (value, value)
+        self._step = None
+        return step
 
 
 class Esc(Member):
@@ -158,8 +173,7 @@ class Esc(Member):
 class Monitor:
     """The gateway and the ESCs of a layout. Times are in ns on the clock of the frames."""
 
-    def __init__(self, bus: BusLayout, make_track: Callable[[], Track] = Track) -> None:
-        self._make_track = make_track
+    def __init__(self, bus: BusLayout) -> None:
         self.file = bus.layout.file.rpartition("/")[2]
         """Name of the DBC in use."""
         self.view = View(SignalReader(bus.layout))
@@ -231,12 +245,19 @@ class Monitor:
                     track.history.extend([esc.number(source)] * repeats)
         return now
 
+    def restart_extremes(self) -> None:
+        """Restart minimum and maximum, and keep the history."""
+        for esc in self.escs:
+            for track in esc.tracks.values():
+                track.low = None
+                track.high = None
+
     def reset(self) -> None:
         """Restart extremes and history."""
         self._tracked: dict[int, tuple[Esc, str]] = {}
         """ESC and source of each column that has a track."""
         for esc in self.escs:
-            esc.tracks = {quantity.source: self._make_track() for quantity in QUANTITIES}
+            esc.tracks = {quantity.source: Track() for quantity in QUANTITIES}
             for source in esc.tracks:
                 if esc.has(source):
                     self._tracked[esc.columns[source]] = (esc, source)

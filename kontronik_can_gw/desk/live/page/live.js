@@ -297,7 +297,7 @@
     byId("plots").replaceChildren();
     view = timePlots({ escs: layout.escs, times, errors: [] }, [-stepCount, 0], showNow);
     layout.plots.forEach((plot) => {
-      for (const item of plot.series) item.values = times.map(() => null);
+      for (const item of plot.series) Object.assign(item, { drawn: true, values: times.map(() => null) });
       view.addLines(plot);
     });
     view.setTheme(root.classList.contains("dark"));
