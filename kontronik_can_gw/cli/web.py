@@ -106,8 +106,14 @@ def main(args: argparse.Namespace) -> int:
         flights = Flights(*_captures_of(args, source), cache)
         hub = server.Hub(Content(source, flights.disk))
         page = server.LiveServer(hub, sock, None if is_open else address.token, flights)
-        arguments = (source, hub, stopped.is_set)
-        thread = threading.Thread(target=server.feed, args=arguments, daemon=True)
+
+        def feed() -> None:
+            try:
+                server.feed(source, hub, stopped.is_set)
+            finally:
+                page.stop()  # a page without updates is useless; systemd starts it again
+
+        thread = threading.Thread(target=feed, daemon=True)
         with stopping_on_signals(page.stop):
             _announce(source, address)
             thread.start()
