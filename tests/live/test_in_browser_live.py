@@ -11,10 +11,10 @@ import pytest
 from live_bench import FedBus, Line, ServedPage, wait_until
 from recordings import capture_bytes
 from report_browser import MISSING, PROGRAM, Browser
-from simulated_bus import Timed, flight, with_errors
+from simulated_bus import FLYING, Timed, flight, with_errors
 
 from kontronik_can_gw.desk.live.flights import Flights
-from kontronik_can_gw.esc.kontronik.simulator import EscOptions
+from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.times import SECOND as S
 
@@ -145,7 +145,27 @@ def test_a_page_continues_after_a_restart_of_the_server(
     browser.errors.clear()  # the browser reports each refused connection
 
 
-def test_lost_telemetry_is_grey_with_its_age_and_the_other_esc_goes_on(
+def test_one_esc_loses_telemetry_and_the_other_goes_on(
+    browser: Browser, bus: FedBus, page: ServedPage
+) -> None:
+    """The telemetry of the left ESC is lost from 5 to 8 s."""
+    silent = EscOptions(profile=FLYING, faults=Faults(dropout=Dropout(3 * S, 8 * S)))
+    fly(bus, 7.5, silent)
+    browser.open(page.url, ready=READY)
+    wait_for_updates(browser)
+    left, right = figures(browser, 0), figures(browser, 1)
+    for source in ("battery_voltage", "motor_speed", "power_stage_temperature"):
+        text, age, style = left[source]
+        assert text != "–"
+        assert age.endswith(" s old")
+        assert "old" in style.split()
+        assert "old" not in right[source][2].split()
+    alarm = browser.run("document.querySelector('#alarms li').textContent")
+    assert alarm.startswith("left: no telemetry")
+    assert "running" in browser.run("document.querySelector('#state').textContent")
+
+
+def test_an_error_is_in_title_and_icon_and_a_silent_gateway_is_told(
     browser: Browser, bus: FedBus, page: ServedPage
 ) -> None:
     fly(bus, 12, with_errors(OperatingError.UNDERVOLTAGE))
@@ -156,18 +176,10 @@ def test_lost_telemetry_is_grey_with_its_age_and_the_other_esc_goes_on(
     alarm = browser.run("document.querySelector('#alarms li').textContent")
     assert "left: battery voltage too low" in alarm
     bus.feed([], 14 * S)
-    wait_until(
-        lambda: (
-            "no gateway heard for 2 s"
-            in browser.run("document.querySelector('#state').textContent")
-        ),
-        "the silence",
-    )
+    state = "document.querySelector('#state').textContent"
+    wait_until(lambda: "no gateway heard for 2 s" in browser.run(state), "the silence")
     wait_for_updates(browser)
-    text, age, style = figures(browser)["battery_voltage"]
-    assert "old" in style.split()
-    assert text != "–"
-    assert age.endswith(" s old")
+    assert "old" in figures(browser)["battery_voltage"][2].split()
 
 
 def test_reset_pause_and_zoom(browser: Browser, bus: FedBus, page: ServedPage) -> None:

@@ -352,7 +352,9 @@ class Flights:
         if free >= 2 * self._min_free_bytes:
             return ""
         limit = self._min_free_bytes // 1_000_000
-        return f"disk of the captures: {free // 1_000_000} MB free. Recording pauses below {limit}."
+        return (
+            f"disk of the captures: {free // 1_000_000} MB free. Recording pauses below {limit} MB."
+        )
 
 
 def _restrict(pid: int) -> None:
