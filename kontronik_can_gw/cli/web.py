@@ -171,10 +171,10 @@ def _print_code(address: "Address", stream: TextIO) -> None:
 
 
 def _captures_of(args: argparse.Namespace, source: Source) -> tuple[Path | None, int]:
-    """Return the folder of captures, or None, and the free space that a recorder leaves."""
+    """Return the folder of captures, or None, and the MB that a recorder leaves free."""
     config = None if source.is_file else source.bus.config
     record = RecordConfig() if config is None else config.record
     folder = args.captures
     if folder is None and config is not None:
         folder = record_folder(config)
-    return folder, record.min_free_mb * 1_000_000
+    return folder, record.min_free_mb

@@ -112,11 +112,11 @@ class Flights:
     """The list of flights, and the worker that makes their files."""
 
     def __init__(
-        self, folder: Path | None = None, min_free_bytes: int = 0, cache: Path = Path()
+        self, folder: Path | None = None, min_free_mb: int = 0, cache: Path = Path()
     ) -> None:
         self._folder = folder
         self._cache = cache / "flights"
-        self._min_free_bytes = min_free_bytes
+        self._min_free_mb = min_free_mb
         self._recordings: dict[str, Recording] = {}
         self._jobs: dict[tuple[str, str], Recording] = {}
         """The requested files in their order, by id and kind."""
@@ -348,13 +348,11 @@ class Flights:
             status = os.statvfs(self._folder)
         except OSError:
             return ""
-        free = status.f_bavail * status.f_frsize
-        if free >= 2 * self._min_free_bytes:
+        free_mb = status.f_bavail * status.f_frsize // 1_000_000
+        limit_mb = self._min_free_mb
+        if free_mb >= 2 * limit_mb:
             return ""
-        limit = self._min_free_bytes // 1_000_000
-        return (
-            f"disk of the captures: {free // 1_000_000} MB free. Recording pauses below {limit} MB."
-        )
+        return f"disk of the captures: {free_mb} MB free. Recording pauses below {limit_mb} MB."
 
 
 def _restrict(pid: int) -> None:
