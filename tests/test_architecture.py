@@ -16,6 +16,7 @@ ORDER = (
     "printable",
     "errors",
     "frames",
+    "entry_kinds",
     "light_imports",
     "times",
     "status",

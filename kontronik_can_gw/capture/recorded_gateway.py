@@ -3,14 +3,16 @@
 A replay of the calls in their order gives the same frames (capture/replay.py).
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
 from operator import attrgetter
 from typing import Any
 
-from kontronik_can_gw.capture.format import COUNTERS, EntryKind, frame_data, numbers_data
+from kontronik_can_gw.capture.calls import Recorded, RecordedCall, calls_by_method
+from kontronik_can_gw.capture.format import COUNTERS, EntryKind, numbers_data
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.status import CanState, GatewayStatus
+from kontronik_can_gw.status import GatewayStatus
 
 Put = Callable[[int, int, int, bytes, int, int | None], None]
 """A function with the fields of ``Entry``: time, kind, ESC's index, data, flags, arrival."""
@@ -21,7 +23,34 @@ Call = tuple[int, int, int, bytes, int | None]
 """Time, kind, ESC's index, data, arrival."""
 
 
-class RecordedGateway(Gateway):
+class _Recorder(Gateway):
+    """A gateway whose calls in the table ``CALLS`` are recorded before they are made."""
+
+    def record(self, call: RecordedCall, recorded: Recorded) -> None:
+        raise NotImplementedError
+
+
+def _recording(method: str, calls: Sequence[RecordedCall]) -> Callable[..., Any]:
+    """Return the gateway's method, so that a call that fits one of ``calls`` is recorded."""
+    plain = getattr(Gateway, method)
+
+    @wraps(plain)
+    def record_and_call(gateway: _Recorder, *args: Any, **named: Any) -> Any:
+        for call in calls:
+            recorded = call.encoding.write(*args, **named)
+            if recorded is not None:
+                gateway.record(call, recorded)
+                break
+        return plain(gateway, *args, **named)
+
+    return record_and_call
+
+
+for _method, _calls in calls_by_method():
+    setattr(_Recorder, _method, _recording(_method, _calls))
+
+
+class RecordedGateway(_Recorder):
     """A gateway that records its calls.
 
     The runtime also changes the counters of ``status`` and the line errors. These changes are
@@ -37,96 +66,25 @@ class RecordedGateway(Gateway):
         self._counters = _counters_of(self.status)
         self._line_errors = [0] * len(self.escs)
 
-    def start(self, now: int, can_open: bool = True) -> None:
-        self._note(now, EntryKind.START, flags=int(can_open))
-        super().start(now, can_open)
-
-    def stop(self, now: int) -> None:
-        self._note(now, EntryKind.STOP)
-        super().stop(now)
-
-    def receive_bytes(
-        self,
-        esc: int,
-        data: bytes,
-        now: int,
-        since: int,
-    ) -> None:
-        self._note(now, EntryKind.BYTES, esc, data, came=since)
-        super().receive_bytes(esc, data, now, since)
-
-    def receive_frame(self, frame: CanFrame, now: int, at: int) -> None:
-        self._note_line_errors(now)
-        data = frame_data(frame)
-        self._note(now, EntryKind.FRAME, data=data, came=at)
-        super().receive_frame(frame, now, at)
-
-    def held_up(self, now: int, dropped: bool) -> None:
-        self._note(now, EntryKind.HELD_UP, flags=int(dropped))
-        super().held_up(now, dropped)
-
-    def hold(self, now: int, is_earlier: bool = False) -> None:
-        self._note(now, EntryKind.HOLD, flags=int(not is_earlier))
-        super().hold(now, is_earlier)
-
-    def limit(self, is_limited: bool, has_discarded: bool, now: int) -> None:
-        self._note(now, EntryKind.LIMIT, flags=is_limited | has_discarded << 1)
-        super().limit(is_limited, has_discarded, now)
+    def record(self, call: RecordedCall, recorded: Recorded) -> None:
+        """Record a call, and before it the changes since the last one."""
+        now, esc, data, flags, came = recorded
+        if call.follows_line_errors:
+            self._note_line_errors(now)
+        self._note_counters(now)
+        self._put(now, call.kind, esc, data, flags, came)
 
     def take_some(self, messages: int, now: int) -> list[CanFrame]:
         if not self.output_frames and not (messages and self.core.is_pending):
             return []
-        self._note(now, EntryKind.TAKE, flags=messages)
         frames = super().take_some(messages, now)
         self._counters = _with_sent(self._counters, len(frames))
         return frames
 
     def first_frame(self, now: int) -> CanFrame | None:
-        self._note(now, EntryKind.FIRST_FRAME)
         frame = super().first_frame(now)
-        if frame is not None:
-            self._counters = _with_sent(self._counters, 1)
+        self._counters = _with_sent(self._counters, int(frame is not None))
         return frame
-
-    def release(self, now: int) -> None:
-        self._note(now, EntryKind.RELEASE)
-        super().release(now)
-
-    def can_opened(self, now: int) -> None:
-        self._note(now, EntryKind.CAN_OPENED)
-        super().can_opened(now)
-
-    def receive_overrun(self, now: int) -> None:
-        self._note(now, EntryKind.OVERRUN)
-        super().receive_overrun(now)
-
-    def saved(self, esc: int, error: str | None, now: int) -> None:
-        has_failed = error is not None
-        reason = (error or "").encode()
-        self._note(now, EntryKind.SAVED, esc, reason, flags=int(has_failed))
-        super().saved(esc, error, now)
-
-    def parameters_damaged(self, esc: int, now: int) -> None:
-        self._note(now, EntryKind.DAMAGED, esc)
-        super().parameters_damaged(esc, now)
-
-    def port(self, esc: int, is_open: bool, now: int) -> None:
-        self._note(now, EntryKind.PORT_OPENED if is_open else EntryKind.PORT_LOST, esc)
-        super().port(esc, is_open, now)
-
-    def can_returned(self, now: int) -> None:
-        self._note(now, EntryKind.CAN_RETURNED)
-        super().can_returned(now)
-
-    def set_can_state(self, state: CanState, now: int) -> None:
-        self._note(now, EntryKind.CAN_STATE, flags=int(state))
-        super().set_can_state(state, now)
-
-    def advance(self, now: int, with_core: bool = True) -> None:
-        if with_core:  # otherwise the core's own call was recorded
-            self._note_line_errors(now)
-            self._note(now, EntryKind.ADVANCE)
-        super().advance(now, with_core)
 
     def take_frames(self, now: int) -> list[CanFrame]:
         frames = super().take_frames(now)
@@ -154,18 +112,6 @@ class RecordedGateway(Gateway):
                 self._line_errors[index] = line_errors
                 data = numbers_data(line_errors)
                 self._put(now, EntryKind.LINE_ERRORS, index, data, 0, None)
-
-    def _note(
-        self,
-        now: int,
-        kind: EntryKind,
-        esc: int = 0,
-        data: bytes = b"",
-        flags: int = 0,
-        came: int | None = None,
-    ) -> None:
-        self._note_counters(now)
-        self._put(now, kind, esc, data, flags, came)
 
     def _note_counters(self, now: int) -> None:
         counters = _counters_of(self.status)

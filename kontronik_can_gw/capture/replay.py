@@ -8,17 +8,16 @@ entry is missing. Nothing waits or is sent.
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from kontronik_can_gw.capture.calls import CALL_OF, RecordedCall
 from kontronik_can_gw.capture.format import (
     COUNTERS,
     Entry,
     EntryKind,
-    read_frame,
     read_json,
     read_numbers,
 )
 from kontronik_can_gw.capture.limits import LATER_OF_ESC, check_counters, check_state, check_time
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.gateway.gate_table import UNLIMITED
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
 from kontronik_can_gw.status import CanState, GatewayState
@@ -109,65 +108,56 @@ class Replay:
         return found
 
     def _play(self, entry: Entry) -> list[TimedFrame]:
-        now, kind, esc, data, flags, came = entry
-        check_time(now)
-        if came is None:
-            came = now
-        check_time(came)
-        gateway = self.gateway
-        if not self._started and kind == EntryKind.ADVANCE:  # the beginning of the run is missing
-            self._adopt_until = now + SETTLE_NS
-            self._start(now, True)
-        if kind == EntryKind.BYTES:
-            gateway.receive_bytes(esc, data, now, came)
-        elif kind == EntryKind.ADVANCE:
-            gateway.advance(now)
-            self._collect_frames(now)
-        elif kind == EntryKind.FRAME:
-            frame = read_frame(data)
-            gateway.receive_frame(frame, now, came)
-            return [TimedFrame(now, frame, True)]
-        elif kind == EntryKind.START:
-            self._start(now, bool(flags))
-            self._collect_frames(now)
-        elif kind == EntryKind.FIRST_FRAME:
-            self._take_first_frame(now)
-        elif kind == EntryKind.STOP:
-            gateway.stop(now)
-            self._collect_frames(now)
-        elif kind == EntryKind.TAKE:
-            self._add_taken(gateway.take_some(min(flags, UNLIMITED), now), now)
-        elif kind == EntryKind.COUNTERS:
-            counters = read_numbers(data)
-            check_counters(counters)
-            for name, value in zip(COUNTERS, counters, strict=False):
-                setattr(gateway.status, name, value)
-        elif kind == EntryKind.LINE_ERRORS:
-            (gateway.escs[esc].line_errors,) = read_numbers(data)
-        elif kind == EntryKind.LOST:
-            self.lost += sum(read_numbers(data))
-        elif kind == EntryKind.STATE:
-            if self._adopt_until is not None:
-                state = read_json(data)
-                check_state(state)
-                self._adopt(state)
-                if now >= self._adopt_until:
-                    self._adopt_until = None
-        elif kind != EntryKind.CLOCK:
-            _repeat_rare(gateway, entry)
+        check_time(entry.time_ns)
+        if entry.came_ns is not None:
+            check_time(entry.came_ns)
+        call = CALL_OF.get(EntryKind(entry.kind))
+        if call is None:
+            self._follow_note(entry)
+            return []
+        if not self._started and call.kind == EntryKind.ADVANCE:  # the run's beginning is missing
+            self._adopt_until = entry.time_ns + SETTLE_NS
+            self._make_call(CALL_OF[EntryKind.START], (entry.time_ns, True))
+        arguments = call.encoding.read(entry)
+        result = self._make_call(call, arguments)
+        if call.takes_frames:
+            self._collect_frames(entry.time_ns)
+        if call.kind == EntryKind.FRAME:
+            return [TimedFrame(entry.time_ns, arguments[0], True)]
+        if isinstance(result, CanFrame):
+            self.gateway.status.sent_frames += 1
+            self._taken = [TimedFrame(entry.time_ns, result)]
+        elif isinstance(result, list):
+            self._add_taken(result, entry.time_ns)
         return []
 
-    def _start(self, now: int, can_open: bool) -> None:
-        self._started = True
-        self.gateway.start(now, can_open)
-        if self._marked:
-            self.gateway.status.state = GatewayState.REPLAY
+    def _make_call(self, call: RecordedCall, arguments: tuple[Any, ...]) -> object:
+        """Make a recorded call. Returns its result: frames that were sent, or None."""
+        result: object = getattr(self.gateway, call.method)(*arguments)
+        if call.kind == EntryKind.START:
+            self._started = True
+            if self._marked:
+                self.gateway.status.state = GatewayState.REPLAY
+        return result
 
-    def _take_first_frame(self, now: int) -> None:
-        frame = self.gateway.first_frame(now)
-        if frame is not None:
-            self.gateway.status.sent_frames += 1
-            self._taken = [TimedFrame(now, frame)]
+    def _follow_note(self, entry: Entry) -> None:
+        """Follow an entry that is not a call."""
+        match entry.kind:
+            case EntryKind.COUNTERS:
+                counters = read_numbers(entry.data)
+                check_counters(counters)
+                for name, value in zip(COUNTERS, counters, strict=False):
+                    setattr(self.gateway.status, name, value)
+            case EntryKind.LINE_ERRORS:
+                (self.gateway.escs[entry.esc].line_errors,) = read_numbers(entry.data)
+            case EntryKind.LOST:
+                self.lost += sum(read_numbers(entry.data))
+            case EntryKind.STATE if self._adopt_until is not None:
+                state = read_json(entry.data)
+                check_state(state)
+                self._adopt(state)
+                if entry.time_ns >= self._adopt_until:
+                    self._adopt_until = None
 
     def _collect_frames(self, now: int) -> None:
         gateway = self.gateway
@@ -209,42 +199,6 @@ class Replay:
             self.gateway.is_held = True
         if state.get("is_limited"):
             self.gateway.is_limited = True
-
-
-def _repeat_rare(gateway: Gateway, entry: Entry) -> None:
-    """Repeat a call of one of the rarer kinds. An unknown kind raises KeyError."""
-    now = entry.time_ns
-    esc = entry.esc
-    match entry.kind:
-        case EntryKind.PORT_OPENED:
-            gateway.port(esc, True, now)
-        case EntryKind.PORT_LOST:
-            gateway.port(esc, False, now)
-        case EntryKind.CAN_OPENED:
-            gateway.can_opened(now)
-        case EntryKind.CAN_RETURNED:
-            gateway.can_returned(now)
-        case EntryKind.HOLD:
-            gateway.hold(now, is_earlier=not entry.flags)
-        case EntryKind.LIMIT:
-            gateway.limit(bool(entry.flags & 1), bool(entry.flags & 2), now)
-        case EntryKind.RELEASE:
-            gateway.release(now)
-        case EntryKind.HELD_UP:
-            gateway.held_up(now, bool(entry.flags))
-        case EntryKind.CAN_STATE:
-            gateway.set_can_state(CanState(entry.flags), now)
-        case EntryKind.OVERRUN:
-            gateway.receive_overrun(now)
-        case EntryKind.SAVED:
-            error = None
-            if entry.flags:
-                error = entry.data.decode("utf-8", "replace")
-            gateway.saved(esc, error, now)
-        case EntryKind.DAMAGED:
-            gateway.parameters_damaged(esc, now)
-        case unknown:
-            raise KeyError(unknown)
 
 
 def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:

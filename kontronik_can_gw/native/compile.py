@@ -16,11 +16,11 @@ from pathlib import Path
 
 from kontronik_can_gw.native.objects import (
     OPTIONS,
+    generated_headers,
     sealed,
     shared_object,
     source_number,
     sources,
-    wire_header,
 )
 
 _LIMIT_S = 120
@@ -87,9 +87,10 @@ def _run(
     options: Sequence[str],
     target: Path,
 ) -> subprocess.CompletedProcess[str]:
-    """Run the compiler with the generated wire.h in a folder of its own."""
+    """Run the compiler with the generated headers in a folder of their own."""
     with tempfile.TemporaryDirectory(prefix="kcg-wire.") as folder:
-        (Path(folder) / "wire.h").write_text(wire_header(), encoding="ascii")
+        for name, text in generated_headers().items():
+            (Path(folder) / name).write_text(text, encoding="ascii")
         command = [program, "-std=c99", "-fwrapv", "-fPIC", "-shared", "-o", str(target)]
         command += ["-I", folder, f"-DKCG_SOURCE={source_number()}"]
         command += [str(source) for source in sources() if source.suffix == ".c"]

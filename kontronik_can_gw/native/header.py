@@ -10,7 +10,7 @@ from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
-from kontronik_can_gw.native.objects import FOLDER, OPTIONS, wire_header
+from kontronik_can_gw.native.objects import FOLDER, OPTIONS, generated_headers
 
 
 class NotInCore(ValueError):
@@ -72,7 +72,7 @@ _FILES = ("core.h", "offline.h", "linux.h")
 
 
 def _text_without_comments() -> str:
-    texts = [wire_header()]
+    texts = [*generated_headers().values()]
     for name in _FILES:
         texts.append((FOLDER / name).read_text(encoding="utf-8"))
     return re.sub(r"/\*.*?\*/", "", "".join(texts), flags=re.DOTALL)

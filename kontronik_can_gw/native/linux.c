@@ -79,7 +79,7 @@ static int fetch(kcg_turns *t, int fd, kcg_input *in)
        at the end of the turn. */
     int64_t passed = r->since + size * KCG_BYTE_NS;
     in->undrained_ns = passed < t->times.now ? passed : t->times.now;
-    note(t, KCG_NOTE_BYTES, in->esc, r->data, r->size, r->since);
+    note(t, KCG_ENTRY_BYTES, in->esc, r->data, r->size, r->since);
     return 1;
 }
 
@@ -457,7 +457,7 @@ static int turn(kcg_turns *t)
             return 0;
         if (is_idle(t))
             return may_wait(t);
-        note(t, KCG_NOTE_ADVANCE, 0, NULL, 0, KCG_DRAINED);
+        note(t, KCG_ENTRY_ADVANCE, 0, NULL, 0, KCG_DRAINED);
         *event = kcg_advance(t->core, t->times.now);
         r->has_advanced = 1;
     }

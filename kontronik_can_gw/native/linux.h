@@ -4,6 +4,7 @@
 #include <poll.h>
 
 #include "core.h"
+#include "entries.h" /* Generated: kinds of recorded calls. */
 
 enum {
     KCG_OUT = 512,      /* Frames that can wait for the bus. */
@@ -13,11 +14,6 @@ enum {
     KCG_FDS = 1024,     /* Descriptors that are watched. */
     KCG_AT_ONCE = 64,   /* Ports served in one turn; frames given to the kernel in one call. */
     KCG_SETTINGS = 64   /* Bytes of a copy of struct termios. */
-};
-/* Kinds of entries (capture/format.py, EntryKind). */
-enum {
-    KCG_NOTE_BYTES = 1,
-    KCG_NOTE_ADVANCE = 3
 };
 
 #define KCG_OUTPUTS (1 << 29)          /* An event: let time pass for the outputs. */

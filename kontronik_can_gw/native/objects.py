@@ -8,6 +8,7 @@ import sys
 import zlib
 from pathlib import Path
 
+from kontronik_can_gw.entry_kinds import entries_header
 from kontronik_can_gw.esc.kontronik.c_header import wire_header as wire_header
 
 FOLDER = Path(__file__).parent
@@ -37,13 +38,18 @@ def shared_object(machine: str = "") -> Path:
 
 
 def sources() -> list[Path]:
-    """Return all C files and headers of the core except the generated wire.h."""
+    """Return all C files and headers of the core except the generated ones."""
     return sorted(FOLDER.glob("*.[ch]"))
 
 
+def generated_headers() -> dict[str, str]:
+    """Return the text of each generated header by its name."""
+    return {"wire.h": wire_header(), "entries.h": entries_header()}
+
+
 def source_number() -> int:
-    """Return a number of sources, wire.h and options, which an object made of them carries."""
-    texts = [*OPTIONS, wire_header()]
+    """Return a number of sources and options, which an object made of them carries."""
+    texts = [*OPTIONS, *generated_headers().values()]
     found = zlib.crc32(" ".join(texts).encode())
     for source in sources():
         found = zlib.crc32(source.read_bytes(), found)

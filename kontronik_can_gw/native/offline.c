@@ -1,3 +1,4 @@
+#include "entries.h"
 #include "offline.h"
 
 #include <string.h>
@@ -12,14 +13,6 @@
    events of each frame. */
 typedef char kcg_max_read_is_too_large_for_kcg_found
     [(KCG_MAX_READ + KCG_MAX_HELD) / KCG_SHORTEST_FRAME <= KCG_FOUND ? 1 : -1];
-/* Kinds of entries (twin: capture/format.py, EntryKind). */
-enum {
-    BYTES = 1,
-    FRAME = 2,
-    ADVANCE = 3,
-    COUNTERS = 14,
-    NOT_SENT = 18
-};
 enum {
     COUNT = 4,                     /* Bytes of a block's number of entries. */
     ENTRY = 16,                    /* Bytes of an entry. */
@@ -181,7 +174,7 @@ int kcg_is_intact(const uint8_t *p, size_t size)
     for (uint64_t k = 0; at <= size && k < count; k++) {
         const uint8_t *e = p + COUNT + k * ENTRY;
         uint32_t length = u32(e + 12);
-        if ((e[8] == BYTES || e[8] == FRAME) && length < TIME)
+        if ((e[8] == KCG_ENTRY_BYTES || e[8] == KCG_ENTRY_FRAME) && length < TIME)
             return 0;
         at += length;
     }
@@ -215,7 +208,7 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
         if (time >= END_OF_TIME || o->last >= END_OF_TIME)
             return KCG_OTHER_ENTRY;
         int64_t now = (int64_t)time > o->last ? (int64_t)time : o->last;
-        if (kind == BYTES) {
+        if (kind == KCG_ENTRY_BYTES) {
             uint64_t since = u64(data);
             int has_esc = esc < o->core->plan->escs;
             if (!has_esc || since >= END_OF_TIME || length - TIME > KCG_MAX_READ)
@@ -223,17 +216,17 @@ int kcg_play(kcg_offline *o, const uint8_t *p, size_t size)
             if (is_full(o))
                 return KCG_IS_FULL;
             receive(o, (int)esc, data + TIME, length - TIME, now, (int64_t)since);
-        } else if (kind == ADVANCE) {
+        } else if (kind == KCG_ENTRY_ADVANCE) {
             if (o->core->gateway[KCG_IS_QUIET] && o->core->gateway[KCG_ESCS_OK])
                 return KCG_OTHER_ENTRY; /* Quiet mode ends, and the owner holds the frames. */
             if (is_full(o))
                 return KCG_IS_FULL;
             advance(o, now);
             o->core->gateway[SENT_FRAMES] += o->count - sure;
-        } else if (kind == COUNTERS && are_counters(data, length)) {
+        } else if (kind == KCG_ENTRY_COUNTERS && are_counters(data, length)) {
             for (uint32_t k = 0; k < length / TIME; k++)
                 o->core->gateway[SENT_FRAMES + k] = (int64_t)u64(data + k * TIME);
-        } else if (kind == NOT_SENT) {
+        } else if (kind == KCG_ENTRY_NOT_SENT) {
             o->count = o->sure;
             sure = o->count;
         } else {
