@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import cache
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,7 @@ def render(
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _file("page.html"))
 
 
+@cache
 def policy() -> str:
     """Return the Content-Security-Policy of the page, which is the same for every flight."""
     style, library, script = _assets()
