@@ -42,6 +42,8 @@ _PLOTTED = {"battery_voltage": 1, "current": 1, "power": 1, "speed": 1, "tempera
 
 Further lines would hide the first one.
 """
+_GOOD = {"gateway": "running", "CAN": "erroractive"}
+"""The good states of gateway and controller."""
 _MARKS = {"": "", "!": "warning", "!!": "error"}
 
 
@@ -181,17 +183,14 @@ class Content:
             return "error", "no connection to the CAN bus"
         if monitor.silent_ns >= _SILENT_NS and not self.source.is_file:
             return "error", f"no gateway heard for {monitor.silent_ns // SECOND} s"
-        gateway = monitor.gateway.text("gateway_state")
-        can = monitor.gateway.text("can_state")
         severity = "ok"
         parts = []
-        if gateway is not None:
-            parts.append(f"gateway {words(gateway)}")
-            if normalize(gateway) != "running":
-                severity = "warning"
-        if can is not None and normalize(can) != "unknown":
-            parts.append(f"CAN {words(can)}")
-            if normalize(can) != "erroractive":
+        for name, good in _GOOD.items():
+            state = monitor.gateway.text(f"{name.lower()}_state")
+            if state is None or normalize(state) == "unknown":
+                continue
+            parts.append(f"{name} {words(state)}")
+            if normalize(state) != good:
                 severity = "warning"
         if monitor.frame_rate is not None:
             parts.append(f"{monitor.frame_rate:.0f} frames/s")

@@ -13,6 +13,7 @@ import json
 import os
 import re
 import resource
+import stat
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -41,7 +42,7 @@ _COMMANDS = {
 }
 """Module and arguments of the child process for each kind of file."""
 _ENDINGS = {_SUMMARY: "json", "report": "html", "csv": "csv", "parquet": "parquet"}
-_PART = re.compile(r"(.+)-[0-9]+")
+_PART = re.compile(r"(.+)-[0-9]+$")
 """Name of a part of a run without its suffix."""
 _LIMIT_S = 1800
 """Longest time that a child process may take."""
@@ -89,22 +90,18 @@ def _digest(text: str) -> str:
 def recordings_in(folder: Path) -> list[Recording]:
     """Return the recordings of a folder, newest first. Raises OSError if it cannot be read."""
     runs: dict[str, list[tuple[Path, os.stat_result]]] = {}
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if not entry.name.endswith(SUFFIX) or not entry.is_file(follow_symlinks=False):
-                continue
-            with contextlib.suppress(FileNotFoundError):
-                status = entry.stat(follow_symlinks=False)
-                stem = entry.name.removesuffix(SUFFIX)
-                part = _PART.fullmatch(stem)
-                run = part[1] if part else stem
-                runs.setdefault(run, []).append((Path(entry.path), status))
+    for path in sorted(folder.iterdir()):
+        with contextlib.suppress(FileNotFoundError):
+            status = path.lstat()
+            if path.suffix == SUFFIX and stat.S_ISREG(status.st_mode):
+                run = _PART.sub(r"\1", path.stem)
+                runs.setdefault(run, []).append((path, status))
     found = []
     for name, parts in runs.items():
-        parts.sort(key=lambda each: each[0].name)
+        paths = tuple(path for path, _ in parts)
         size = sum(status.st_size for _, status in parts)
         changed_ns = max(status.st_mtime_ns for _, status in parts)
-        found.append(Recording(name, tuple(path for path, _ in parts), size, changed_ns))
+        found.append(Recording(name, paths, size, changed_ns))
     return sorted(found, key=lambda each: (each.changed_ns, each.name), reverse=True)
 
 

@@ -189,6 +189,7 @@ class _Limited(H11Protocol):
     """A connection of uvicorn with limits of number and time."""
 
     _all: ClassVar[set["_Limited"]] = set()
+    _timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
@@ -206,7 +207,7 @@ class _Limited(H11Protocol):
                 return
         self._all.add(self)
         self.made = self.loop.time()
-        self._timer: asyncio.TimerHandle | None = self.loop.call_later(_REQUEST_S, self._check)
+        self._timer = self.loop.call_later(_REQUEST_S, self._check)
 
     def _check(self) -> None:
         if self.cycle is None:
@@ -227,9 +228,8 @@ class _Limited(H11Protocol):
         self._end_timer()
 
     def _end_timer(self) -> None:
-        timer = getattr(self, "_timer", None)
-        if timer is not None:
-            timer.cancel()
+        if self._timer is not None:
+            self._timer.cancel()
 
 
 class _Server(uvicorn.Server):
