@@ -63,7 +63,8 @@ class RecordedGateway(_Recorder):
         """Make a gateway with the arguments ``args`` and ``more``."""
         super().__init__(*args, **more)
         self._put = put
-        self._counters = _counters_of(self.status)
+        self.recorded_counters = _counters_of(self.status)
+        """The counters that a replay has after the entries so far. Waiting frames count as sent."""
         self._line_errors = [0] * len(self.escs)
 
     def record(self, call: RecordedCall, recorded: Recorded) -> None:
@@ -78,17 +79,17 @@ class RecordedGateway(_Recorder):
         if not self.output_frames and not (messages and self.core.is_pending):
             return []
         frames = super().take_some(messages, now)
-        self._counters = _with_sent(self._counters, len(frames))
+        self.recorded_counters = _with_sent(self.recorded_counters, len(frames))
         return frames
 
     def first_frame(self, now: int) -> CanFrame | None:
         frame = super().first_frame(now)
-        self._counters = _with_sent(self._counters, int(frame is not None))
+        self.recorded_counters = _with_sent(self.recorded_counters, int(frame is not None))
         return frame
 
     def take_frames(self, now: int) -> list[CanFrame]:
         frames = super().take_frames(now)
-        self._counters = _with_sent(self._counters, len(frames))
+        self.recorded_counters = _with_sent(self.recorded_counters, len(frames))
         return frames
 
     def not_sent(self, now: int) -> None:
@@ -101,7 +102,7 @@ class RecordedGateway(_Recorder):
 
     def turned(self, calls: Iterable[Call], frames: int) -> None:
         """Record the calls of the core by turns in C. ``frames``: number of frames taken."""
-        self._counters = _with_sent(self._counters, frames)
+        self.recorded_counters = _with_sent(self.recorded_counters, frames)
         for now, kind, esc, data, came in calls:
             self._put(now, kind, esc, data, 0, came)
 
@@ -115,8 +116,8 @@ class RecordedGateway(_Recorder):
 
     def _note_counters(self, now: int) -> None:
         counters = _counters_of(self.status)
-        if counters != self._counters:
-            self._counters = counters
+        if counters != self.recorded_counters:
+            self.recorded_counters = counters
             data = numbers_data(*counters)
             self._put(now, EntryKind.COUNTERS, 0, data, 0, None)
 
@@ -130,7 +131,7 @@ def _with_sent(counters: tuple[int, ...], frames: int) -> tuple[int, ...]:
     return (sent + frames, *others)
 
 
-def state_of(gateway: Gateway) -> dict[str, Any]:
+def state_of(gateway: RecordedGateway) -> dict[str, Any]:
     """Return the state with which a replay can begin now."""
     escs = []
     for esc in gateway.escs:
@@ -146,7 +147,7 @@ def state_of(gateway: Gateway) -> dict[str, Any]:
     return {
         "escs": escs,
         "messages": gateway.core.places(),
-        "counters": _counters_of(gateway.status),
+        "counters": gateway.recorded_counters,
         "can_state": int(gateway.status.can_state),
         "is_held": int(gateway.is_held),
         "is_limited": int(gateway.is_limited),

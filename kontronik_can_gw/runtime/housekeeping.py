@@ -9,7 +9,7 @@ import logging
 import time
 from collections.abc import Sequence
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.can.can_link import CanLink
@@ -28,6 +28,7 @@ from kontronik_can_gw.status import name_in_words
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
+    from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
     from kontronik_can_gw.runtime.files.recorder import Recorder
 
 log = logging.getLogger("kontronik_can_gw")
@@ -168,7 +169,8 @@ class Housekeeping:
         """Give the gateway's state to the recorder, and log the recorder's faults."""
         if self._recorder is None:
             return
-        self._recorder.note(self._gateway, now)
+        gateway = cast("RecordedGateway", self._gateway)  # a recorder records one
+        self._recorder.note(gateway, now)
         self._log(self._recorder.reports(now), now)
         for name, text in self._recorder.take_events():
             self._conditions.event(name, text, now, logging.INFO)

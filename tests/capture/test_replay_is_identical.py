@@ -125,6 +125,30 @@ def test_messages_of_a_later_part_alone_are_exact_once_it_has_settled(
     assert found == live
 
 
+def test_frames_that_waited_when_the_state_was_noted_count_as_sent() -> None:
+    """The socket takes six frames at once, so the others of a turn are sent after the state."""
+    bench = Bench(*made(1))
+    run = bench.running(1, wild=False)
+    now = run(3)
+    gateway = bench.gateway
+    state = state_of(gateway)
+    first_entry = len(bench.entries)
+    for _ in range(12):
+        now += SECOND
+        gateway.advance(now)
+        frames = gateway.take_frames(now)
+        assert len(frames) > 6
+        gateway.status.sent_frames += 6
+        data = json_payload(state_of(gateway))
+        bench.entries.append(Entry(now, EntryKind.STATE, data=data))
+        gateway.status.sent_frames += len(frames) - 6
+    later = bench.setup.gateway(bench.layout, START)
+    replay = Replay(later, state)
+    list(replay.follow(bench.entries[first_entry:]))
+    assert replay.rejected == 0
+    assert later.status.sent_frames == gateway.status.sent_frames
+
+
 def test_a_marked_replay_differs_only_in_the_state() -> None:
     bench = Bench(*made(1)).live(3, 4, wild=False)
     found = bench.setup.database()

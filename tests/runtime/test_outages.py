@@ -227,7 +227,7 @@ def test_a_blocked_interface_that_is_restarted_sends_no_old_value(
 
 
 def test_a_recording_that_begins_in_an_outage_holds_frames_in_its_replay() -> None:
-    gateway = Gateway(ESCS, layout_of(ESCS), 0)
+    gateway = RecordedGateway(lambda *_: None, ESCS, layout_of(ESCS), 0)
     gateway.start(0)
     gateway.hold(0)
     replayed = Gateway(ESCS, layout_of(ESCS), 0)

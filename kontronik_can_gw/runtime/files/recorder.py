@@ -33,10 +33,9 @@ from kontronik_can_gw.capture.format import (
     numbers_data,
     packed,
 )
-from kontronik_can_gw.capture.recorded_gateway import devices_of, state_of
+from kontronik_can_gw.capture.recorded_gateway import RecordedGateway, devices_of, state_of
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.errors import RunError
-from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.files.disk import (
     is_locked,
     open_regular,
@@ -173,7 +172,7 @@ class Recorder:
         else:
             self._entries.append((time_ns, kind, esc, data, flags, came_ns))
 
-    def note(self, gateway: Gateway, now: int) -> None:
+    def note(self, gateway: RecordedGateway, now: int) -> None:
         """Record the gateway's state and devices. A replay of a later part begins with them."""
         self._devices = devices_of(gateway)
         if now - self._state_ns >= STATE_NS:
