@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from kontronik_can_gw.assembly.this_machine import ThisMachine, parameter_folder
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
-from kontronik_can_gw.core.output_setup import OUTPUTS, Machine, OutputSetup, setup_module
+from kontronik_can_gw.core.output_setup import OUTPUTS, HostMachine, OutputSetup, setup_module
 from kontronik_can_gw.dbc.prepare import (
     check_load,
     prepare,
@@ -133,7 +133,7 @@ def check_devices(config: Config) -> None:
 
 def _configured(
     config: Config,
-    machine: Machine,
+    machine: HostMachine,
     problems: list[str],
 ) -> list[OutputSetup]:
     """Return the setups of the enabled outputs, without stored parameters.

@@ -11,7 +11,7 @@ from typing import Any
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Value, Variable
-from kontronik_can_gw.canopen.eds import FLOATS, SIGNED, TYPE_BITS, Entry, range_of
+from kontronik_can_gw.canopen.eds import FLOATS, SIGNED, TYPE_BITS, EdsEntry, range_of
 from kontronik_can_gw.canopen.objects import LINK, Bound, bindings_of
 from kontronik_can_gw.core.slots import SlotPlan
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
@@ -100,7 +100,7 @@ def compile_pdo(mapped: Sequence[Variable]) -> SlotPlan:
 
 
 @lru_cache(_MAX_PDOS)
-def _shared_pdo(shown: tuple[tuple[Entry, Bound], ...]) -> SlotPlan:
+def _shared_pdo(shown: tuple[tuple[EdsEntry, Bound], ...]) -> SlotPlan:
     variables = []
     for entry, bound in shown:
         variable = Variable(entry)

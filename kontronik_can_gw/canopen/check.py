@@ -11,7 +11,7 @@ from kontronik_can_gw.canopen.eds import (
     TYPE_NAMES,
     WHOLE,
     Eds,
-    Entry,
+    EdsEntry,
     range_of,
 )
 from kontronik_can_gw.canopen.node_settings import NodeSettings, NodeSetup, configured_settings
@@ -24,7 +24,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
 Place = tuple[int, int]
-Mistake = tuple[Entry, str]
+Mistake = tuple[EdsEntry, str]
 
 _PDOS = range(COMMUNICATION, COMMUNICATION + MAX_TPDOS)
 _MAPPINGS = range(MAPPING, MAPPING + MAX_TPDOS)
@@ -64,7 +64,7 @@ def check_eds(
         raise UserError(*(f"{eds.name}: {problem}" for problem in without_duplicates))
 
 
-def _missing(entries: Mapping[Place, Entry]) -> Iterator[str]:
+def _missing(entries: Mapping[Place, EdsEntry]) -> Iterator[str]:
     """Yield the mandatory objects that are missing.
 
     Each object needs its sub-index 0, and the two objects of a PDO need each other.
@@ -81,7 +81,7 @@ def _missing(entries: Mapping[Place, Entry]) -> Iterator[str]:
         yield f"{index:04X}h:{sub:02X} is mandatory but missing. Add it."
 
 
-def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
+def _objects(entries: Mapping[Place, EdsEntry], shipped: Eds) -> Iterator[Mistake]:
     """Yield mistakes in type, access and default of objects that telemetry and services use."""
     known = {(entry.index, entry.sub): entry for entry in shipped.entries}
     for (index, sub), entry in entries.items():
@@ -105,10 +105,10 @@ def _objects(entries: Mapping[Place, Entry], shipped: Eds) -> Iterator[Mistake]:
 
 
 def _reference(
-    known: Mapping[Place, Entry],
+    known: Mapping[Place, EdsEntry],
     index: int,
     sub: int,
-) -> Entry | None:
+) -> EdsEntry | None:
     """Return the entry of the shipped EDS that an entry must be like, or None.
 
     All PDOs are like the first one. Members that the shipped EDS lacks are like sub-index 1.
@@ -125,7 +125,7 @@ def _reference(
     return reference
 
 
-def _unlike(entry: Entry, shipped: Entry) -> Iterator[str]:
+def _unlike(entry: EdsEntry, shipped: EdsEntry) -> Iterator[str]:
     """Yield the differences that make an object useless for its service."""
     index = entry.index
     kind = entry.data_type
@@ -146,7 +146,7 @@ def _unlike(entry: Entry, shipped: Entry) -> Iterator[str]:
 
 
 def _settings(
-    entries: Mapping[Place, Entry],
+    entries: Mapping[Place, EdsEntry],
     escs: Sequence[EscSettings],
 ) -> Iterator[Mistake]:
     """Yield configured settings that do not fit their objects."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dbc_names import emergency_names, pascal_case
 from kontronik_can_gw.canopen.dictionary import Variable
-from kontronik_can_gw.canopen.eds import Entry
+from kontronik_can_gw.canopen.eds import EdsEntry
 from kontronik_can_gw.canopen.objects import Bound
 from kontronik_can_gw.dbc.writer import SignalRow
 from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol
@@ -211,7 +211,7 @@ def _complete(
     return names
 
 
-def _stem(entry: Entry) -> str:
+def _stem(entry: EdsEntry) -> str:
     """Return a signal name for an object, whose name may have any characters."""
     stem = pascal_case(entry.name)
     if re.fullmatch("[A-Z].*[a-z].*", stem):

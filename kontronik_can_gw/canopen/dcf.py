@@ -11,7 +11,7 @@ from kontronik_can_gw.canopen.eds import (
     TYPE_BITS,
     UNICODE_STRING,
     Eds,
-    Entry,
+    EdsEntry,
     Section,
     bare,
     integer,
@@ -131,7 +131,7 @@ def _device_commissioning(
     return node
 
 
-def _value_text(name: str, entry: Entry, value: float | bytes) -> str:
+def _value_text(name: str, entry: EdsEntry, value: float | bytes) -> str:
     """Return the text of a ParameterValue. UserError if an INI file cannot hold it."""
     if isinstance(value, float):
         return repr(value)

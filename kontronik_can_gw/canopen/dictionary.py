@@ -7,7 +7,7 @@ It is built from an EDS. A variable either stores its value or is bound to a ser
 from collections.abc import Callable, Iterator, Mapping
 from enum import IntEnum
 
-from kontronik_can_gw.canopen.eds import CODECS, DOMAIN_TYPE, Eds, Entry
+from kontronik_can_gw.canopen.eds import CODECS, DOMAIN_TYPE, Eds, EdsEntry
 from kontronik_can_gw.canopen.objects import Bound
 
 Value = int | float | bytes
@@ -82,7 +82,7 @@ class Variable:
 
     __slots__ = ("bound", "check", "codec", "entry", "power_on", "read", "value", "written")
 
-    def __init__(self, entry: Entry) -> None:
+    def __init__(self, entry: EdsEntry) -> None:
         self.entry = entry
         self.codec = CODECS.get(entry.data_type)
         self.bound: Bound | None = None

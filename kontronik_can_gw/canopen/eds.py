@@ -218,7 +218,7 @@ _NODE_ID = re.compile(
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class EdsEntry:
     """One entry of the object dictionary, as the EDS describes it.
 
     ``access`` is ro, wo, rw, rwr, rww or const. ``default`` is an int, a float, or bytes for texts
@@ -247,7 +247,7 @@ class Eds:
 
     data: bytes
     name: str
-    entries: tuple[Entry, ...]
+    entries: tuple[EdsEntry, ...]
     """All entries, ordered by index and sub-index."""
     object_names: dict[int, str]
 
@@ -268,7 +268,7 @@ def load(data: bytes, name: str) -> Eds:
         raise UserError(f"{name}: is larger than {MAX_BYTES // 1_000_000} MB. Is it an EDS?")
     problems: list[str] = []
     sections = read_sections(data, problems)
-    entries: list[Entry] = []
+    entries: list[EdsEntry] = []
     object_names: dict[int, str] = {}
     for index, sub, section in _entry_sections(sections, problems):
         try:
@@ -342,7 +342,7 @@ def _objects(sections: Mapping[str, Section]) -> dict[int, dict[int, Section]]:
     return objects
 
 
-def _entry(section: Section, index: int, sub: int) -> Entry:
+def _entry(section: Section, index: int, sub: int) -> EdsEntry:
     """Return the entry of a section. ValueError for a mistake."""
     is_domain = section.number("ObjectType") == _DOMAIN_OBJECT
     data_type = section.number("DataType", DOMAIN_TYPE if is_domain else 0)
@@ -364,7 +364,7 @@ def _entry(section: Section, index: int, sub: int) -> Entry:
             raise ValueError(
                 f"{section.quoted('DefaultValue')}: above {section.quoted('HighLimit')}."
             )
-    return Entry(
+    return EdsEntry(
         index=index,
         sub=sub,
         name=section.get("ParameterName"),

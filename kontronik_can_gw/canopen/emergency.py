@@ -16,8 +16,8 @@ from kontronik_can_gw.canopen.emergency_codes import (
     FROM_GATEWAY,
     OF_COMMUNICATION,
     BitCodes,
-    Condition,
     GatewayError,
+    PresentError,
     register_of,
 )
 from kontronik_can_gw.status import UNCONFIGURED
@@ -59,14 +59,14 @@ class Emergencies:
         """The newest error word of the ESC."""
         self._registered = 0
         """Bits of 1001h that the ESC's error word sets."""
-        self._active: dict[Condition, None] = {}
+        self._active: dict[PresentError, None] = {}
         """Present errors in the order in which they began."""
-        self._unreported: dict[Condition, None] = {}
+        self._unreported: dict[PresentError, None] = {}
         """Errors that began while no emergencies could be sent."""
         self._last_is_error = False
         """True if the last emergency sent was an error, not 0000h."""
-        self._pending: deque[tuple[Condition | None, bytes]] = deque(maxlen=_MAX_PENDING)
-        self._delayed: list[tuple[int, Condition, bytes]] = []
+        self._pending: deque[tuple[PresentError | None, bytes]] = deque(maxlen=_MAX_PENDING)
+        self._delayed: list[tuple[int, PresentError, bytes]] = []
         """Time, condition and data of emergencies that ``advance`` sorts and reports."""
         self._delayed_since = NEVER
         """Time since which emergencies are delayed. NEVER if they are not."""
@@ -169,7 +169,7 @@ class Emergencies:
         code, own_detail = error.value
         if detail is None:
             detail = own_detail
-        condition = Condition(code, FROM_GATEWAY, detail)
+        condition = PresentError(code, FROM_GATEWAY, detail)
         if present and condition not in self._active:
             if error is GatewayError.TELEMETRY_LOST and self._open:
                 self._delayed_since = min(self._delayed_since, now)
@@ -266,7 +266,7 @@ class Emergencies:
             self._pending += [(condition, data) for _, condition, data in delayed]
             self._send_pending(now)
 
-    def _sort_newest(self, conditions: Sequence[Condition]) -> None:
+    def _sort_newest(self, conditions: Sequence[PresentError]) -> None:
         """Put the newest entries of 1003h, and the present errors, into this order."""
         for _ in conditions[: len(self.history)]:
             self.history.popleft()
@@ -285,7 +285,7 @@ class Emergencies:
                 self._last_is_error = condition is not None
                 self._last_ns = now
 
-    def _begin(self, condition: Condition, now: int, at: int | None) -> None:
+    def _begin(self, condition: PresentError, now: int, at: int | None) -> None:
         self._active[condition] = None
         self._had_error = True
         self._note(condition)
@@ -298,7 +298,7 @@ class Emergencies:
         else:
             self._unreported[condition] = None
 
-    def _note(self, condition: Condition) -> None:
+    def _note(self, condition: PresentError) -> None:
         entry = condition.detail << 24 | condition.source << 16 | condition.code
         self.history.appendleft(entry)
 
@@ -314,11 +314,11 @@ class Emergencies:
             self._report(None)
             self._send_pending(now)
 
-    def _report(self, condition: Condition | None) -> None:
+    def _report(self, condition: PresentError | None) -> None:
         # a full queue drops its oldest entry
         self._pending.append((condition, self._data_of(condition)))
 
-    def _data_of(self, condition: Condition | None) -> bytes:
+    def _data_of(self, condition: PresentError | None) -> bytes:
         if condition is None:
             return _DATA.pack(0, self.register, FROM_GATEWAY, 0)
         code, source, detail = condition

@@ -93,7 +93,7 @@ OF_COMMUNICATION = frozenset(
 """Error codes that a reset of communication ends."""
 
 
-class Condition(NamedTuple):
+class PresentError(NamedTuple):
     """An error while it is present."""
 
     code: int
@@ -129,7 +129,7 @@ class BitCodes:
         """Return the emergency code of a bit: a standard code if there is one, else FF00h + bit."""
         return self._codes.get(bit, 0xFF00 + bit)
 
-    def of(self, word: int, mask: int) -> tuple[tuple[Condition, ...], int]:
+    def of(self, word: int, mask: int) -> tuple[tuple[PresentError, ...], int]:
         """Return the errors of an error word that cause emergencies, and the bits of 1001h.
 
         Each bit in the mask causes an emergency, a summary bit only if no other bit explains it.
@@ -145,7 +145,7 @@ class BitCodes:
             register |= register_of(self.code(bit))
         conditions = []
         for bit in _bits_of(bits):
-            condition = Condition(self.code(bit), bit, 0)
+            condition = PresentError(self.code(bit), bit, 0)
             conditions.append(condition)
         return tuple(conditions), register
 

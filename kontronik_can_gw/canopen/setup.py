@@ -32,7 +32,7 @@ from kontronik_can_gw.core.header_parts import (
     whole_number,
 )
 from kontronik_can_gw.core.output import OutputHost
-from kontronik_can_gw.core.output_setup import Machine, OutputSetup
+from kontronik_can_gw.core.output_setup import HostMachine, OutputSetup
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import classic_bits
@@ -146,7 +146,7 @@ class CanopenSetup(OutputSetup):
         escs = self.escs or (EscSettings(),) * len(self.settings)
         return self.esc_settings(escs)
 
-    def with_stored(self, machine: Machine) -> "CanopenSetup":
+    def with_stored(self, machine: HostMachine) -> "CanopenSetup":
         stored: list[Stored] = []
         faults: list[tuple[int, str]] = []
         notes = list(self.notes)
@@ -248,7 +248,7 @@ def shipped_canopen(node_ids: Iterable[int]) -> CanopenSetup:
 # --- from a configuration
 
 
-def configured(config: Config, machine: Machine) -> CanopenSetup:
+def configured(config: Config, machine: HostMachine) -> CanopenSetup:
     """Return the nodes of a configuration and its EDS. Raises UserError with every mistake."""
     canopen = config.canopen
     eds = _read_eds(config, machine)
@@ -288,7 +288,7 @@ def configured(config: Config, machine: Machine) -> CanopenSetup:
     )
 
 
-def _read_eds(config: Config, machine: Machine) -> Eds:
+def _read_eds(config: Config, machine: HostMachine) -> Eds:
     """Read and check the EDS. Raises UserError with every mistake in it."""
     path = config.eds_path
     # One byte more, to recognise a file that is too large.
@@ -310,7 +310,7 @@ def _read_eds(config: Config, machine: Machine) -> Eds:
     return eds
 
 
-def _reference(eds: Eds, path: Path, machine: Machine) -> Eds:
+def _reference(eds: Eds, path: Path, machine: HostMachine) -> Eds:
     """Return the shipped EDS, which ``eds`` from this path may be."""
     file = shipped(_SHIPPED)
     if path == file:

@@ -10,7 +10,7 @@ from kontronik_can_gw.cli.common import announced_config, canopen_setup, load_al
 from kontronik_can_gw.cli.desk import bus_layout
 from kontronik_can_gw.cli.output import configuration_files, write_output
 from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
-from kontronik_can_gw.desk.describe.markdown import Table, markdown
+from kontronik_can_gw.desk.describe.markdown import MarkdownTable, markdown
 from kontronik_can_gw.desk.describe.tables import dbc, values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.printable import printable, printable_json
@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _json(tables: list[Table]) -> str:
+def _json(tables: list[MarkdownTable]) -> str:
     document: dict[str, object] = {
         "format": "kontronik-can-gw description",
         "version": 2,
@@ -65,7 +65,7 @@ def _json(tables: list[Table]) -> str:
     return printable_json(document, indent=2, allow_nan=False) + "\n"
 
 
-def _tables(args: argparse.Namespace) -> list[Table]:
+def _tables(args: argparse.Namespace) -> list[MarkdownTable]:
     if args.config is None and args.dbc is None:
         args.config = announced_config()
     bus: BusLayout | None = None
@@ -80,7 +80,7 @@ def _tables(args: argparse.Namespace) -> list[Table]:
         nodes = canopen_setup(loaded)
         if loaded.database:
             bus = BusLayout(loaded.database, loaded.layout, escs, loaded.config)
-    found: list[Table] = []
+    found: list[MarkdownTable] = []
     if bus is not None:
         found += dbc(bus, escs)
     if nodes is not None:

@@ -33,7 +33,7 @@ from kontronik_can_gw.desk.doctor.clock import check_clock
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.desk.doctor.ports import check_port, diagnoses
 from kontronik_can_gw.desk.doctor.service import (
-    Unit,
+    ServiceUnit,
     check_file_system,
     check_folder,
     check_service,
@@ -161,7 +161,9 @@ def _outputs(findings: Findings, loaded: Loaded) -> None:
         findings.add("config.warning", "any", warning=warning)
 
 
-def _folders(machine: Machine, findings: Findings, config: Config, unit: Unit | None) -> None:
+def _folders(
+    machine: Machine, findings: Findings, config: Config, unit: ServiceUnit | None
+) -> None:
     """Check the folders to which the gateway writes."""
     store = parameter_folder(config) if config.canopen.enabled else None
     status = config.statistics_path

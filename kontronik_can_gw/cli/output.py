@@ -19,7 +19,7 @@ from kontronik_can_gw.cli import discard_output, say
 from kontronik_can_gw.cli.arguments import default_config
 from kontronik_can_gw.cli.common import stopping_on_signals
 from kontronik_can_gw.config.parse import load
-from kontronik_can_gw.desk.recordings.convert import Output, check_part, part_beside
+from kontronik_can_gw.desk.recordings.convert import OutputFile, check_part, part_beside
 from kontronik_can_gw.desk.recordings.stream import is_standard_input
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
@@ -108,14 +108,14 @@ def writing(
     force: bool,
     keeps_part: bool = False,
     handles_signals: bool = True,
-) -> Iterator[Output]:
+) -> Iterator[OutputFile]:
     """Open an output for writing. Raises RunError if it cannot be written.
 
     ``force``: an existing file is replaced. ``keeps_part``: if writing fails, OUT.part stays.
     ``handles_signals``: SIGTERM, SIGINT and SIGHUP raise KeyboardInterrupt, which is reported.
     Without it the caller handles them.
     """
-    out = Output(None if output == "-" else Path(output), force=force)
+    out = OutputFile(None if output == "-" else Path(output), force=force)
     out.keeps_part = keeps_part
     try:
         with ExitStack() as stack:

@@ -20,7 +20,7 @@ from kontronik_can_gw.cli.recording import record_folder
 from kontronik_can_gw.config.parse import load
 from kontronik_can_gw.desk.doctor import Finding
 from kontronik_can_gw.desk.doctor.machine import Machine
-from kontronik_can_gw.desk.doctor.service import Unit, unit_of
+from kontronik_can_gw.desk.doctor.service import ServiceUnit, unit_of
 from kontronik_can_gw.desk.parcel.archive import write_archive
 from kontronik_can_gw.desk.parcel.parts import (
     Contents,
@@ -142,7 +142,7 @@ def _add_status(contents: Contents, config: Path) -> Any:
 
 
 def capture_folders(
-    machine: Machine, config: Path, unit: Unit | None, document: Any
+    machine: Machine, config: Path, unit: ServiceUnit | None, document: Any
 ) -> Iterator[Path]:
     """Yield the folders of captures: of the running gateway, and of the configuration."""
     for gateway in (document or {}).get("gateways", ()):

@@ -30,7 +30,7 @@ class StoredFile(NamedTuple, Generic[_Content]):
     """A line for the user, or None."""
 
 
-class Machine(Protocol):
+class HostMachine(Protocol):
     """The machine on which an output is configured, and the files there."""
 
     identity: bytes
@@ -124,7 +124,7 @@ class OutputSetup(ABC):
         """Return the settings of the ESCs that are in effect with this output."""
         return list(escs)
 
-    def with_stored(self, machine: Machine) -> "OutputSetup":
+    def with_stored(self, machine: HostMachine) -> "OutputSetup":
         """Return the setup with the parameters that masters stored."""
         return self
 
@@ -154,7 +154,7 @@ class OutputSetup(ABC):
 class SetupModule(Protocol):
     """The module ``setup`` in an output's folder."""
 
-    def configured(self, config: Any, machine: Machine) -> OutputSetup:
+    def configured(self, config: Any, machine: HostMachine) -> OutputSetup:
         """Make the setup from a ``config.keys.Config``, without stored parameters.
 
         Raises UserError with every mistake.

@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 
-class NodeSetup(NamedTuple):
+class DronecanNodeSetup(NamedTuple):
     """The settings of one node."""
 
     node_id: int

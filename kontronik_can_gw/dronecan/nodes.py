@@ -12,7 +12,7 @@ from kontronik_can_gw.core.output import LogLine, Output, OutputHost, Owner
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.allocation import Allocation
 from kontronik_can_gw.dronecan.esc_report import EscReport
-from kontronik_can_gw.dronecan.node_setup import Given, NodeSetup
+from kontronik_can_gw.dronecan.node_setup import DronecanNodeSetup, Given
 from kontronik_can_gw.dronecan.wire import NODE, REQUEST, SERVICE, Assembler, DataType
 from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.frames import CanFrame, id_block
@@ -35,12 +35,12 @@ _ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
 """Ids of Allocation messages: those of an allocator, and the requests of other clients."""
 
 
-class Node:
+class DronecanNode:
     """One DroneCAN node of the gateway."""
 
     def __init__(
         self,
-        setup: NodeSetup,
+        setup: DronecanNodeSetup,
         given: Given,
         reports: Sequence[EscReport],
     ) -> None:
@@ -179,7 +179,7 @@ class Dronecan(Output):
 
     def __init__(
         self,
-        setups: Sequence[NodeSetup],
+        setups: Sequence[DronecanNodeSetup],
         given: Given,
         host: OutputHost,
     ) -> None:
@@ -192,8 +192,8 @@ class Dronecan(Output):
             report = EscReport(esc, table.first_index + number, table)
             report.take_slots(partial(host.slot, number))
             self._reports.append(report)
-        self._nodes = [Node(setup, given, self._reports) for setup in setups]
-        self._by_id: dict[int, Node] = {}
+        self._nodes = [DronecanNode(setup, given, self._reports) for setup in setups]
+        self._by_id: dict[int, DronecanNode] = {}
         """The nodes that have a node-ID."""
         self._allocation = Allocation(given.seed)
         self._assembler = Assembler()
@@ -332,7 +332,9 @@ class Dronecan(Output):
 
     # --- requests
 
-    def _receive_request(self, frame: CanFrame, node: Node, kind: DataType, now: int) -> None:
+    def _receive_request(
+        self, frame: CanFrame, node: DronecanNode, kind: DataType, now: int
+    ) -> None:
         """Answer a request when its last frame has arrived, at most MAX_ANSWERS a second."""
         request = self._assembler.receive(frame.can_id, frame.data, kind.seed, now)
         if request is None:
@@ -375,7 +377,7 @@ class Dronecan(Output):
 
     def _send_node_status(
         self,
-        node: Node,
+        node: DronecanNode,
         now: int,
         mode: int = wire.OPERATIONAL,
     ) -> None:
@@ -384,7 +386,7 @@ class Dronecan(Output):
 
     def _status_of(
         self,
-        node: Node,
+        node: DronecanNode,
         now: int,
         mode: int = wire.OPERATIONAL,
     ) -> bytes:
@@ -402,7 +404,7 @@ class Dronecan(Output):
         self._allocation.ask(unique_id, now)
         self._update_ids()
 
-    def _first_waiting(self) -> Node | None:
+    def _first_waiting(self) -> DronecanNode | None:
         """Return the first node without a node-ID."""
         return next((node for node in self._nodes if not node.node_id), None)
 

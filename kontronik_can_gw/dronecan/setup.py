@@ -10,9 +10,9 @@ from kontronik_can_gw.config.keys import Config
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.core.header_parts import reading, whole_number
 from kontronik_can_gw.core.output import OutputHost
-from kontronik_can_gw.core.output_setup import Machine, OutputSetup
+from kontronik_can_gw.core.output_setup import HostMachine, OutputSetup
 from kontronik_can_gw.dronecan.esc_report import MAX_ESC_INDEX, MAX_RPM, SPEEDS
-from kontronik_can_gw.dronecan.node_setup import Given, NodeSetup
+from kontronik_can_gw.dronecan.node_setup import DronecanNodeSetup, Given
 from kontronik_can_gw.dronecan.nodes import Dronecan
 from kontronik_can_gw.dronecan.wire import MAX_NODE_ID, NODE
 from kontronik_can_gw.errors import UserError
@@ -51,18 +51,18 @@ class DronecanSetup(OutputSetup):
     """One for each message in ``esc_report``."""
 
     @cached_property
-    def nodes(self) -> tuple[NodeSetup, ...]:
+    def nodes(self) -> tuple[DronecanNodeSetup, ...]:
         """The gateway's node, or one for each ESC."""
         table = self.given.table
         first = table.node_id
         if not table.per_esc_nodes:
             numbers = tuple(range(len(self.escs)))
-            return (NodeSetup(first, table.name, self._unique_id(table.name), numbers),)
+            return (DronecanNodeSetup(first, table.name, self._unique_id(table.name), numbers),)
         found = []
         for number, esc in enumerate(self.escs):
             name = f"{table.name}.{esc.name.lower()}"
             node_id = first + number if first else 0
-            found.append(NodeSetup(node_id, name, self._unique_id(name), (number,)))
+            found.append(DronecanNodeSetup(node_id, name, self._unique_id(name), (number,)))
         return tuple(found)
 
     def _unique_id(self, name: str) -> bytes:
@@ -177,11 +177,11 @@ class DronecanSetup(OutputSetup):
         ]
 
 
-def _node_id_text(node: NodeSetup) -> str:
+def _node_id_text(node: DronecanNodeSetup) -> str:
     return f"node {node.node_id}" if node.node_id else "node-ID from an allocator"
 
 
-def configured(config: Config, machine: Machine) -> DronecanSetup:
+def configured(config: Config, machine: HostMachine) -> DronecanSetup:
     """Return the nodes of a configuration. Raises UserError with every mistake in its table."""
     given = Given(config.dronecan, machine.identity, machine.version, machine.random_number())
     try:

@@ -20,7 +20,7 @@ from kontronik_can_gw.runtime.files.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
 from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
 from kontronik_can_gw.runtime.ports.esc_port import LOOK_NS, EscPort
-from kontronik_can_gw.runtime.ports.usb_adapters import Identity
+from kontronik_can_gw.runtime.ports.usb_adapters import UsbIdentity
 from kontronik_can_gw.runtime.status.facts import ProgramFacts
 from kontronik_can_gw.runtime.status.statistics import Statistics
 from kontronik_can_gw.runtime.system.fault_log import FaultLog, duration
@@ -280,7 +280,7 @@ class Loop:
             due = min(due, esc.due)
         return due
 
-    def _others(self, esc: EscPort) -> tuple[Identity | None, ...]:
+    def _others(self, esc: EscPort) -> tuple[UsbIdentity | None, ...]:
         return tuple(other.identity for other in self.escs if other is not esc)
 
     def _esc_at(self, path: str) -> str | None:

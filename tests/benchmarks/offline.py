@@ -47,7 +47,7 @@ def convert(
     dbc: Path | None = None,
 ) -> Run:
     """Convert a recording. With ``live``, only the 16 values of live data are converted."""
-    from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
+    from kontronik_can_gw.desk.recordings.convert import TABLES, OutputFile, to_log, to_table
     from kontronik_can_gw.desk.recordings.fields import Choice
     from kontronik_can_gw.desk.recordings.inputs import open_input
     from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
@@ -66,7 +66,7 @@ def convert(
             choice = Choice.of(recording.fields, LiveData._fields if live else ())
             convert_all = partial(to_table, form=form, choice=choice)
         begun = time.process_time()
-        with Output(target) as out:
+        with OutputFile(target) as out:
             written = convert_all(recording, out)
         return Run(time.process_time() - begun, str(written))
 

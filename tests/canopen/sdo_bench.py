@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from script import MS, Talker, bytes_of, hexadecimal, ms
 
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, Variable, key
-from kontronik_can_gw.canopen.eds import Eds, Entry
+from kontronik_can_gw.canopen.eds import Eds, EdsEntry
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.times import NEVER
 
@@ -45,7 +45,7 @@ class Objects(Dictionary):
 
     def __init__(self) -> None:
         entries = [
-            Entry(index, sub, "", kind, access, False, None, _HIGH.get(index), default, False)
+            EdsEntry(index, sub, "", kind, access, False, None, _HIGH.get(index), default, False)
             for index, sub, kind, access, default in _ENTRIES
         ]
         super().__init__(Eds(b"", "", tuple(entries), {}))

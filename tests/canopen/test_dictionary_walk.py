@@ -8,7 +8,7 @@ import struct
 import pytest
 from dialogue import QUIET, Bench, shipped_eds
 
-from kontronik_can_gw.canopen.eds import Entry
+from kontronik_can_gw.canopen.eds import EdsEntry
 from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.codec import encode as uart
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
@@ -59,15 +59,15 @@ def bench() -> Bench:
     return Bench(changes=QUIET)
 
 
-def entries() -> dict[tuple[int, int], Entry]:
+def entries() -> dict[tuple[int, int], EdsEntry]:
     return {(e.index, e.sub): e for e in shipped_eds().entries}
 
 
-def of(entry: Entry) -> str:
+def of(entry: EdsEntry) -> str:
     return f"{entry.index:04X}h:{entry.sub:02X} {entry.name}"
 
 
-def ends(entry: Entry) -> tuple[int, int]:
+def ends(entry: EdsEntry) -> tuple[int, int]:
     """Return the smallest and the largest value of the type."""
     bits = 8 * struct.calcsize(FORMATS[entry.data_type])
     is_signed = FORMATS[entry.data_type].islower()
@@ -92,7 +92,7 @@ def test_unknown_indices_and_sub_indices_abort_with_their_codes(bench: Bench) ->
 
 
 @pytest.mark.parametrize("entry", shipped_eds().entries, ids=of)
-def test_every_object_has_its_size_and_access(bench: Bench, entry: Entry) -> None:
+def test_every_object_has_its_size_and_access(bench: Bench, entry: EdsEntry) -> None:
     at = entry.index, entry.sub
     data = bench.read(*at)
     if entry.access == "wo":
@@ -120,7 +120,7 @@ RULED = {0x1003, 0x1005, 0x1010, 0x1011, 0x1014, 0x1F80, 0x2101, 0x2102}
 
 
 @pytest.mark.parametrize("entry", LIMITED, ids=of)
-def test_every_object_enforces_its_limits(entry: Entry, bench: Bench) -> None:
+def test_every_object_enforces_its_limits(entry: EdsEntry, bench: Bench) -> None:
     at = entry.index, entry.sub
     least, most = ends(entry)
     low = least if entry.low is None else entry.low

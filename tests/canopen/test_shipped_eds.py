@@ -15,7 +15,7 @@ from eds_text import dcfchk, with_key
 
 from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.eds import Eds, Entry
+from kontronik_can_gw.canopen.eds import Eds, EdsEntry
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import EscConfig
 from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, Row, rows
@@ -38,7 +38,7 @@ def shipped() -> Eds:
 
 
 @pytest.fixture(scope="module")
-def entries(shipped: Eds) -> dict[tuple[int, int], Entry]:
+def entries(shipped: Eds) -> dict[tuple[int, int], EdsEntry]:
     return {(entry.index, entry.sub): entry for entry in shipped.entries}
 
 
@@ -74,7 +74,7 @@ def test_names_are_unique_in_the_file_and_have_at_least_two_characters(shipped: 
     ids=["live frame", "logged extremes"],
 )
 def test_fields_are_in_wire_order_and_have_their_types(
-    entries: dict[tuple[int, int], Entry],
+    entries: dict[tuple[int, int], EdsEntry],
     index: int,
     data: DataType,
 ) -> None:
@@ -95,7 +95,9 @@ def test_fields_are_in_wire_order_and_have_their_types(
         assert shown.steps == row.per_unit, name
 
 
-def test_unit_codes_agree_with_the_table_of_fields(entries: dict[tuple[int, int], Entry]) -> None:
+def test_unit_codes_agree_with_the_table_of_fields(
+    entries: dict[tuple[int, int], EdsEntry],
+) -> None:
     for sub, (name, row) in enumerate(rows(LiveData).items(), 1):
         entry = entries[0x2002, sub]
         assert entry.access == "const"
@@ -113,7 +115,7 @@ def test_unit_codes_agree_with_the_table_of_fields(entries: dict[tuple[int, int]
     [(1, "pole_pairs"), (4, "telemetry_timeout_ms"), (7, "cell_count")],
 )
 def test_settings_have_the_ranges_and_defaults_of_the_configuration(
-    entries: dict[tuple[int, int], Entry],
+    entries: dict[tuple[int, int], EdsEntry],
     sub: int,
     key: str,
 ) -> None:
@@ -142,7 +144,7 @@ def as_bytes(value: object) -> object:
     return value.encode() if isinstance(value, str) else value
 
 
-def power_on(entry: Entry, node_id: int) -> int | float | bytes | None:
+def power_on(entry: EdsEntry, node_id: int) -> int | float | bytes | None:
     """Return the default of an entry for a node."""
     return entry.default + node_id if entry.relative else entry.default  # type: ignore[operator]
 

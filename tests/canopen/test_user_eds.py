@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.check import check_eds
-from kontronik_can_gw.canopen.eds import Entry
+from kontronik_can_gw.canopen.eds import EdsEntry
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
@@ -172,7 +172,7 @@ def test_any_case_lf_comments_and_unknown_sections_are_accepted() -> None:
     assert ours.entries == reader.load(SHIPPED.encode(), "kontronik_esc.eds").entries
 
 
-def entry_2200(content: str) -> Entry:
+def entry_2200(content: str) -> EdsEntry:
     """Return the variable 2200h of an EDS that is accepted."""
     eds = reader.load(with_object(content).encode("ascii"), "mine.eds")
     return next(entry for entry in eds.entries if entry.index == 0x2200)

@@ -21,7 +21,7 @@ from markdown_it import MarkdownIt
 from kontronik_can_gw.canopen.eds import TYPE_NAMES
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.describe.markdown import Table, markdown
+from kontronik_can_gw.desk.describe.markdown import MarkdownTable, markdown
 from kontronik_can_gw.desk.describe.tables import CAN_STATES, GATEWAY_STATES, LINK_STATES
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.esc.telemetry import LinkState
@@ -330,9 +330,9 @@ words = st.one_of(texts, markup)
 def test_any_text_is_read_back_unchanged(title: str, paragraph: str, cell: str) -> None:
     """The text of a DBC or EDS may contain markup."""
     rows = [{"one": cell}, {"one": "y"}]
-    plain = Table(f"T {title}", [paragraph], rows)
+    plain = MarkdownTable(f"T {title}", [paragraph], rows)
     named = [{"one": "x", "head": f"H {title}"}, {"one": "x", "head": "H"}]
-    grouped = Table("B", [], named, by="head")
+    grouped = MarkdownTable("B", [], named, by="head")
     found = texts_of(markdown("All", [], [plain, grouped]))
     assert lines_of(found, "h2") == [one_line(f"T {title}"), "B"]
     assert lines_of(found, "h3") == [one_line(f"H {title}"), "H"]
@@ -355,7 +355,7 @@ def paragraphs(text: str) -> list[str]:
 @example(["word " * 20, "- x", "1. x", "# x", "--- x"] * 2)
 def test_a_long_paragraph_of_any_words_is_read_back_unchanged(paragraph: list[str]) -> None:
     joined = one_line(" ".join(paragraph))
-    found = texts_of(markdown("All", [], [Table("T", [joined])]))
+    found = texts_of(markdown("All", [], [MarkdownTable("T", [joined])]))
     assert lines_of(found, "p") == paragraphs(joined)
     assert found.keys() <= {"h1", "h2", "p"}
 

@@ -26,7 +26,7 @@ from kontronik_can_gw.capture.format import SUFFIX, Block, EntryKind, Scanner, b
 from kontronik_can_gw.cli.parcel import capture_folders
 from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.doctor.service import Unit
+from kontronik_can_gw.desk.doctor.service import ServiceUnit
 from kontronik_can_gw.desk.parcel import archive
 from kontronik_can_gw.desk.parcel.archive import write_archive
 from kontronik_can_gw.desk.parcel.captures import clean_capture
@@ -373,7 +373,7 @@ def test_captures_of_the_running_gateway_and_of_the_service_are_found(tmp_path: 
     file = written(
         tmp_path / "gateway.toml", '[record]\ndirectory = "state"\n[[esc]]\nport = "x"\n'
     )
-    unit = Unit("kontronik-can-gw@left.service", {})
+    unit = ServiceUnit("kontronik-can-gw@left.service", {})
     document = {"gateways": [{"document": {"recording": {"file": "/data/run/a.kcap"}}}]}
     found = list(capture_folders(Tree(tmp_path), file, unit, document))
     state = tmp_path / "var/lib/kontronik-can-gw-left/captures"

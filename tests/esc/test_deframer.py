@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from kontronik_can_gw.esc.kontronik import deframer
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
-from kontronik_can_gw.esc.kontronik.deframer import Counters, Deframer, Frame
+from kontronik_can_gw.esc.kontronik.deframer import Deframer, DeframerCounters, Frame
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 
 from .reference import certain_at, counters_of, form_row, frames_of
@@ -118,7 +118,7 @@ def test_state_at_every_moment_depends_on_the_bytes_alone(stream: bytes, seed: i
 def test_deframer_is_like_new_after_flush(parts: list[bytes], seed: int) -> None:
     source = random.Random(seed)
     deframer = Deframer()
-    total = dict.fromkeys(Counters().as_dict(), 0)
+    total = dict.fromkeys(DeframerCounters().as_dict(), 0)
     base = 0
 
     def moved(frames: list[Frame]) -> list[Frame]:

@@ -16,8 +16,8 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     EscOptions,
     Faults,
     Phase,
-    Sent,
     SimulatedEsc,
+    SimulatedFrame,
     Swap,
     usual_layout,
 )
@@ -31,7 +31,7 @@ from kontronik_can_gw.esc.kontronik.states import (
 S = 1_000_000_000
 
 
-def received(frames: list[Sent]) -> list[Frame]:
+def received(frames: list[SimulatedFrame]) -> list[Frame]:
     deframer = Deframer()
     wire = b"".join(sent.wire for sent in frames)
     return deframer.feed(wire) + deframer.flush()

@@ -33,7 +33,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     SimulatedEsc,
     Swap,
 )
-from kontronik_can_gw.esc.kontronik.simulator import Sent as Wired
+from kontronik_can_gw.esc.kontronik.simulator import SimulatedFrame as Wired
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError, SelfTestError
 from kontronik_can_gw.status import CanState
 

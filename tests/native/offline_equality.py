@@ -14,7 +14,7 @@ from capture_bench import START, Bench, made
 
 from kontronik_can_gw.capture.format import Entry, EntryKind, block, data_payload, json_payload
 from kontronik_can_gw.desk.recordings import bytes_input
-from kontronik_can_gw.desk.recordings.convert import TABLES, Output, to_log, to_table
+from kontronik_can_gw.desk.recordings.convert import TABLES, OutputFile, to_log, to_table
 from kontronik_can_gw.desk.recordings.fields import Choice
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.recording import PlayedBlock
@@ -127,7 +127,7 @@ def read(recording: Input, chosen: Sequence[int]) -> list[Any]:
 def converted(recording: Input, choice: Choice, form: str, path: Path) -> Any:
     """Convert a recording. Return the result of the conversion and the content of its file."""
     path.unlink(missing_ok=True)  # of the other core
-    with Output(path) as out:
+    with OutputFile(path) as out:
         if form in TABLES:
             result = to_table(recording, out, form, choice)
         else:

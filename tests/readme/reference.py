@@ -11,7 +11,7 @@ from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.cli.arguments import Option, Rows
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.describe.canopen_tables import emergencies, objects
-from kontronik_can_gw.desk.describe.markdown import Code, Row, Table, markdown
+from kontronik_can_gw.desk.describe.markdown import Code, MarkdownTable, Row, markdown
 from kontronik_can_gw.desk.describe.tables import configuration, dbc, values
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 
@@ -35,14 +35,14 @@ def pages() -> Iterator[tuple[str, str]]:
         yield f"{name}.md", markdown(title, [LEAD], tables)
 
 
-def _commands() -> Iterator[Table]:
+def _commands() -> Iterator[MarkdownTable]:
     for name, line in COMMANDS.items():
         module = import_module(f"kontronik_can_gw.cli.{name}")
         parts = module.EPILOG.strip().split("\n\n")
         text = [_code_or_text(part) for part in parts]
-        yield Table(name, [_sentence(line), *text], list(_options(module.OPTIONS)))
+        yield MarkdownTable(name, [_sentence(line), *text], list(_options(module.OPTIONS)))
         for action, (about, options) in getattr(module, "ACTIONS", {}).items():
-            yield Table(f"{name} {action}", [_sentence(about)], list(_options(options)))
+            yield MarkdownTable(f"{name} {action}", [_sentence(about)], list(_options(options)))
 
 
 def _code_or_text(part: str) -> Code | str:

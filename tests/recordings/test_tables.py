@@ -28,13 +28,13 @@ from kontronik_can_gw.desk.recordings.convert import _table_writer
 from kontronik_can_gw.desk.recordings.fields import (
     Choice,
     ColumnType,
-    Field,
     Table,
+    TableColumn,
     distinct,
     fields_of_values,
 )
 from kontronik_can_gw.desk.recordings.inputs import open_input
-from kontronik_can_gw.desk.recordings.recording import Block
+from kontronik_can_gw.desk.recordings.recording import RowBlock
 from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -128,7 +128,8 @@ def test_names_that_are_there_twice_get_their_message_in_front() -> None:
     names = ("A X ", "B X ", "B Y ", "B Time ", "C Z Za", "C Z Zb")
     parts = [text.split(" ") for text in names]
     fields = [
-        Field(name, "V", ColumnType.FLOAT, message, signal=own) for message, name, own in parts
+        TableColumn(name, "V", ColumnType.FLOAT, message, signal=own)
+        for message, name, own in parts
     ]
     found = [field.name for field in distinct(fields)]
     assert found == ["A.X", "B.X", "Y", "B.Time", "C.Za", "C.Zb"]
@@ -136,10 +137,10 @@ def test_names_that_are_there_twice_get_their_message_in_front() -> None:
 
 TEXTS = ((0, "Plain"), (1, 'odd, "quoted"'), (7, "{braces}"), (300, "µ"))
 FIELDS = (
-    Field("Flag", "", ColumnType.FLAG, "M"),
-    Field("Whole", "us", ColumnType.WHOLE, "M"),
-    Field("Float", "deg C", ColumnType.FLOAT, "M"),
-    Field("Text", "", ColumnType.TEXT, "M", TEXTS),
+    TableColumn("Flag", "", ColumnType.FLAG, "M"),
+    TableColumn("Whole", "us", ColumnType.WHOLE, "M"),
+    TableColumn("Float", "deg C", ColumnType.FLOAT, "M"),
+    TableColumn("Text", "", ColumnType.TEXT, "M", TEXTS),
 )
 ROW = st.tuples(
     st.integers(0, 10**13),
@@ -166,7 +167,7 @@ def test_any_values_read_back_equal(
     with path.open("wb") as file:
         writer = _table_writer(file, form, Table(FIELDS, has_utc))
         for time_ns, wall_ns, values in rows:
-            writer.write(Block([time_ns], [[value] for value in values], wall_ns - time_ns))
+            writer.write(RowBlock([time_ns], [[value] for value in values], wall_ns - time_ns))
         writer.close()
     found = READ[form](path)
     assert len(found) == len(rows)
@@ -189,7 +190,7 @@ def test_a_row_has_the_same_text_alone_and_among_others(
     columns: list[list[Any]] = [wholes, wholes, floats]
     columns.append([TEXTS[n % 4][1] if n % 3 else None for n in range(13)])
     times = [1000 * n * n for n in range(13)]
-    whole = Block(times, columns, WALL_NS)
+    whole = RowBlock(times, columns, WALL_NS)
     texts = []
     for blocks in ([whole], [whole.part(n, n + 1) for n in range(13)]):
         with (tmp_path / "table").open("wb") as file:

@@ -14,7 +14,7 @@ from simulated_bus import flight
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.recordings.recording import Block
+from kontronik_can_gw.desk.recordings.recording import RowBlock
 from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions
@@ -50,7 +50,7 @@ def flight_of(bus: BusLayout, rows: Iterable[Row], points: int = 2000) -> Flight
     while some := list(islice(every, 100)):
         times, values = zip(*some, strict=True)
         columns = list(zip(*values, strict=True))
-        made.evaluate(Block(times, columns, None))
+        made.evaluate(RowBlock(times, columns, None))
     return made.finish()
 
 

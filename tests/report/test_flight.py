@@ -14,7 +14,7 @@ import pytest
 from report_flights import Row, column, flight_of, rows_of, simulated
 from simulated_bus import layout_of
 
-from kontronik_can_gw.desk.recordings.fields import ColumnType, Field
+from kontronik_can_gw.desk.recordings.fields import ColumnType, TableColumn
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.report.esc import EscFlight
 from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
@@ -283,7 +283,7 @@ def test_words_of_errors_and_states_become_events() -> None:
     }
     fields = []
     for source, kind in kinds.items():
-        fields.append(Field(source, "", kind, source=source, esc=0, signal=source))
+        fields.append(TableColumn(source, "", kind, source=source, esc=0, signal=source))
     esc = EscFlight(0, layout_of(["esc1"]).escs[0], fields, events)
     programming = 1 << OperatingError.PROGRAMMING_ALLOWED
     unknown = 1 << 30

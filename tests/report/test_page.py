@@ -10,7 +10,7 @@ from report_flights import data_of, flight_of, rows_of, simulated
 from simulated_bus import layout_of
 
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
-from kontronik_can_gw.desk.recordings.recording import Block
+from kontronik_can_gw.desk.recordings.recording import RowBlock
 from kontronik_can_gw.desk.recordings.samples import fields_of_log
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import of_like_size, render
@@ -176,7 +176,7 @@ def test_a_part_after_a_gap_of_years_starts_at_its_own_time_of_day() -> None:
     fields = fields_of_log(SignalReader(bus.layout), bus.escs)
     made = Flight(bus.escs, fields, window=(15.0, None))
     for time_ns, values in rows_of(bus, times, battery_voltage=[24.0] * 200):
-        made.evaluate(Block([time_ns], [[value] for value in values], None))
+        made.evaluate(RowBlock([time_ns], [[value] for value in values], None))
     html = render(made.finish(), source="y", wall_ns=0)
     assert "<dd>1971-02-05 00:00:12 UTC</dd>" in html
 

@@ -28,20 +28,20 @@ from kontronik_can_gw.runtime.ports import esc_port as esc_input
 from kontronik_can_gw.runtime.ports import serial_port, usb_adapters
 from kontronik_can_gw.runtime.ports.esc_port import EscPort
 from kontronik_can_gw.runtime.ports.serial_port import NoPort, PortLost, is_mini_uart
-from kontronik_can_gw.runtime.ports.usb_adapters import Identity
+from kontronik_can_gw.runtime.ports.usb_adapters import UsbIdentity
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS, SECOND
 
-LEFT = Identity(0x403, 0x6001, "A1", "1.0")
-RIGHT = Identity(0x403, 0x6001, "B2", "1.0")
+LEFT = UsbIdentity(0x403, 0x6001, "A1", "1.0")
+RIGHT = UsbIdentity(0x403, 0x6001, "B2", "1.0")
 LIVE = codec.encode(LiveData(battery_voltage=2442), codec.WireLayout.V4)
 
 
 class Port(Wire):
     """A serial port with scripted reads. ``there`` maps each path to its adapter."""
 
-    there: dict[str, Identity | None]
+    there: dict[str, UsbIdentity | None]
 
     def __init__(self, path: str, _protocol: object) -> None:
         if path not in self.there:
@@ -51,7 +51,7 @@ class Port(Wire):
         self.reads: list[bytes | Exception] = []
         self.counts: dict[str, int] = {"parity": 5}
 
-    def identity(self) -> Identity | None:
+    def identity(self) -> UsbIdentity | None:
         return self.there[self.path]
 
     def read(self, most: int = 0) -> bytes:
@@ -96,12 +96,12 @@ class Bench:
 
 
 @pytest.fixture
-def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, Identity | None]:
-    ports: dict[str, Identity | None] = {}
+def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, UsbIdentity | None]:
+    ports: dict[str, UsbIdentity | None] = {}
     Port.there = ports
     monkeypatch.setattr(esc_input, "SerialPort", Port)
 
-    def usb_ports() -> list[tuple[str, Identity]]:
+    def usb_ports() -> list[tuple[str, UsbIdentity]]:
         return [(path, identity) for path, identity in ports.items() if identity is not None]
 
     monkeypatch.setattr(usb_adapters, "adapters", usb_ports)
@@ -109,7 +109,7 @@ def there(monkeypatch: pytest.MonkeyPatch) -> dict[str, Identity | None]:
 
 
 @pytest.fixture
-def bench(there: dict[str, Identity | None]) -> Bench:
+def bench(there: dict[str, UsbIdentity | None]) -> Bench:
     """Return a bench with one ESC on /dev/ttyUSB0."""
     there[USB0] = LEFT
     return Bench(USB0)
@@ -120,7 +120,7 @@ BY_ID = "/dev/serial/by-id/usb-FTDI"
 BY_PATH = "/dev/serial/by-path/usb-0:1"
 BOTH = {USB0: LEFT, USB1: RIGHT}
 TURNED = {USB0: RIGHT, USB1: LEFT}
-REPLUGGED: dict[str, tuple[dict[str, Identity], dict[str, Identity], list[str | None]]] = {
+REPLUGGED: dict[str, tuple[dict[str, UsbIdentity], dict[str, UsbIdentity], list[str | None]]] = {
     "an adapter under another number is found": ({USB0: LEFT}, {USB3: LEFT}, [USB3]),
     "two in the other order keep their ESCs": (BOTH, TURNED, [USB1, USB0]),
     "left does not show the values of right": (BOTH, {USB0: RIGHT}, [None, USB0]),
@@ -134,9 +134,9 @@ REPLUGGED: dict[str, tuple[dict[str, Identity], dict[str, Identity], list[str | 
 
 @pytest.mark.parametrize(("before", "after", "found"), REPLUGGED.values(), ids=REPLUGGED.keys())
 def test_each_esc_gets_its_own_adapter_after_replugging(
-    there: dict[str, Identity | None],
-    before: dict[str, Identity],
-    after: dict[str, Identity],
+    there: dict[str, UsbIdentity | None],
+    before: dict[str, UsbIdentity],
+    after: dict[str, UsbIdentity],
     found: list[str | None],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -158,7 +158,7 @@ def test_each_esc_gets_its_own_adapter_after_replugging(
             assert esc.identity == after[path]
 
 
-def test_an_esc_is_found_by_its_adapter(there: dict[str, Identity | None], bench: Bench) -> None:
+def test_an_esc_is_found_by_its_adapter(there: dict[str, UsbIdentity | None], bench: Bench) -> None:
     there.clear()
     bench.lose(0, SECOND)
     there["/dev/ttyUSB1"] = LEFT
@@ -168,7 +168,7 @@ def test_an_esc_is_found_by_its_adapter(there: dict[str, Identity | None], bench
 
 
 def test_attempts_to_open_do_not_change_since_when_a_port_is_lost(
-    there: dict[str, Identity | None],
+    there: dict[str, UsbIdentity | None],
     bench: Bench,
 ) -> None:
     esc = bench.escs[0]
@@ -242,7 +242,7 @@ def test_a_diagnosis_is_logged_once_and_ends_with_telemetry(
 
 
 def test_an_unplugged_port_is_logged_once_until_it_is_back(
-    there: dict[str, Identity | None],
+    there: dict[str, UsbIdentity | None],
     bench: Bench,
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
@@ -269,7 +269,7 @@ def test_an_unplugged_port_is_logged_once_until_it_is_back(
 
 
 def test_a_mini_uart_causes_a_warning_when_it_is_opened(
-    there: dict[str, Identity | None],
+    there: dict[str, UsbIdentity | None],
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -360,9 +360,9 @@ def test_a_usb_adapter_is_identified_by_its_numbers_or_its_location(
     monkeypatch.setattr(usb_adapters, "SysFS", found)
     monkeypatch.setattr(Path, "glob", lambda _, kind: map(Path, plugged) if "USB" in kind else ())
     assert dict(usb_adapters.adapters()) == {
-        "/dev/ttyUSB0": Identity(0x403, 0x6001, "A1", ""),
-        "/dev/ttyUSB1": Identity(0x403, 0x6011, "A1", "1.3"),
-        "/dev/ttyUSB2": Identity(0x403, 0x6001, "", "1-1.2"),
+        "/dev/ttyUSB0": UsbIdentity(0x403, 0x6001, "A1", ""),
+        "/dev/ttyUSB1": UsbIdentity(0x403, 0x6011, "A1", "1.3"),
+        "/dev/ttyUSB2": UsbIdentity(0x403, 0x6001, "", "1-1.2"),
     }
 
 

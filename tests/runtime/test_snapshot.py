@@ -9,7 +9,7 @@ import pytest
 from statistics_bench import Bench, moment_of
 
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
-from kontronik_can_gw.esc.kontronik.deframer import Counters
+from kontronik_can_gw.esc.kontronik.deframer import DeframerCounters
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults
@@ -85,7 +85,7 @@ def test_all_counters_of_the_stream_and_of_the_gateway_are_shown() -> None:
     bench.run(3)
     document = bench.document()
     counters = document["escs"][0]["counters"]
-    assert {f.name for f in fields(Counters)} <= set(counters)
+    assert {f.name for f in fields(DeframerCounters)} <= set(counters)
     assert counters["dropped_bytes"] > 0
     assert counters == {
         **bench.gateway.escs[0].counters.as_dict(),

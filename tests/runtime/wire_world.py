@@ -31,7 +31,7 @@ from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.runtime.poller import Handler, Poller
 from kontronik_can_gw.runtime.ports import esc_port as esc_input
 from kontronik_can_gw.runtime.ports.serial_port import PortLost
-from kontronik_can_gw.runtime.ports.usb_adapters import Identity
+from kontronik_can_gw.runtime.ports.usb_adapters import UsbIdentity
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import CanState
@@ -159,7 +159,7 @@ class Wire:
     def discard(self) -> None:
         self._read += self.waiting
 
-    def identity(self) -> Identity | None:
+    def identity(self) -> UsbIdentity | None:
         return None
 
     def line_errors(self) -> dict[str, int]:

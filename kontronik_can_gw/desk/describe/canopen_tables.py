@@ -9,12 +9,12 @@ from pathlib import PurePath
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dictionary import Dictionary
-from kontronik_can_gw.canopen.eds import TYPE_NAMES, Eds, Entry
+from kontronik_can_gw.canopen.eds import TYPE_NAMES, Eds, EdsEntry
 from kontronik_can_gw.canopen.emergency_codes import BitCodes, GatewayError, register_of
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.setup import CanopenSetup
-from kontronik_can_gw.desk.describe.markdown import Row, Table
+from kontronik_can_gw.desk.describe.markdown import MarkdownTable, Row
 from kontronik_can_gw.desk.describe.tables import meanings_of, number, protocols_of
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.status import UNCONFIGURED
@@ -29,7 +29,7 @@ _EMERGENCIES = (
 )
 
 
-def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
+def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[MarkdownTable]:
     """Return tables of the nodes' COB-IDs and TPDOs, and of their object dictionary."""
     eds = setup.eds
     named = []
@@ -41,19 +41,19 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[Table]:
     text = [f"{PurePath(eds.name).name}. {refused}"]
     meanings = meanings_of(escs)
     return [
-        Table(
+        MarkdownTable(
             "COB-IDs",
             ["There is a node for each ESC. A node that waits for LSS uses only a few COB-IDs."],
             list(_cob_ids(named)),
             by="node",
         ),
-        Table(
+        MarkdownTable(
             "TPDOs",
             ["The TPDOs as they are when the node starts."],
             list(_pdos(named)),
             by="node",
         ),
-        Table("Objects", text, [_object(eds, entry, meanings) for entry in eds.entries]),
+        MarkdownTable("Objects", text, [_object(eds, entry, meanings) for entry in eds.entries]),
     ]
 
 
@@ -95,7 +95,7 @@ _LONG_AGE = "65534 means this age or more, and 65535 that nothing has arrived ye
 _NOTES = {"data_age": _LONG_AGE, "info_age": _LONG_AGE}
 
 
-def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
+def _object(eds: Eds, entry: EdsEntry, meanings: Mapping[str, str]) -> Row:
     """Return the row of an entry.
 
     The value in ``unit`` is raw * ``step``. ``node_id`` is true if the node-ID is added to the
@@ -139,7 +139,7 @@ def _object(eds: Eds, entry: Entry, meanings: Mapping[str, str]) -> Row:
 # --- emergencies
 
 
-def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[Table]:
+def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[MarkdownTable]:
     """Return the table of emergencies: bits that the EDS enables, and faults of the gateway."""
     mask = 0 if eds is None else Dictionary(eds).number(*_MASK)
     rows: list[Row] = []
@@ -169,7 +169,7 @@ def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[Table]:
         about = (fault.name.lower(), fault.meaning, fault.remedy)
         rows.append(_emergency(code, "FFh", byte4, about))
     rows.append(_emergency(0, "FFh", 0, ("no_error", "all errors have ended", "Nothing to do.")))
-    return [Table("Emergencies", [_EMERGENCIES], rows)]
+    return [MarkdownTable("Emergencies", [_EMERGENCIES], rows)]
 
 
 def _emergency(code: int, byte3: str, byte4: int | None, about: tuple[str, str, str]) -> Row:

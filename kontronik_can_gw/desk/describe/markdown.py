@@ -20,7 +20,7 @@ class Code(str):
     __slots__ = ()
 
 
-class Table(NamedTuple):
+class MarkdownTable(NamedTuple):
     """A table of plain data."""
 
     title: str
@@ -32,7 +32,7 @@ class Table(NamedTuple):
     """A column whose values become headings, each with a table of its rows. Empty: one table."""
 
 
-def markdown(title: str, lead: Iterable[str], tables: Iterable[Table]) -> str:
+def markdown(title: str, lead: Iterable[str], tables: Iterable[MarkdownTable]) -> str:
     """Return the Markdown text, with a line end at its end.
 
     Columns that are empty in all rows of a table are left out.

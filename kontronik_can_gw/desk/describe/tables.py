@@ -18,7 +18,7 @@ from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import TABLES, shipped
 from kontronik_can_gw.dbc.prepare import is_mute, reporter
-from kontronik_can_gw.desk.describe.markdown import Row, Table
+from kontronik_can_gw.desk.describe.markdown import MarkdownTable, Row
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.esc.decoder import EscProtocol, State
 from kontronik_can_gw.esc.protocols import protocol_named
@@ -45,12 +45,12 @@ _SEND_TYPES = {
 # --- configuration
 
 
-def configuration() -> list[Table]:
+def configuration() -> list[MarkdownTable]:
     """Return a table for each table of the TOML configuration."""
     found = []
     for name, table in TABLES.items():
         title = f"[[{name}]]" if name == "esc" else f"[{name}]"
-        found.append(Table(title, [table.__doc__ or ""], _keys(table)))
+        found.append(MarkdownTable(title, [table.__doc__ or ""], _keys(table)))
     return found
 
 
@@ -82,7 +82,7 @@ def _default(key: Field[Any]) -> object:
 # --- DBC
 
 
-def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[Table]:
+def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[MarkdownTable]:
     """Return tables of the messages that the gateway sends, and of their signals."""
     layout = bus.layout
     copies = bus.copies()
@@ -101,8 +101,8 @@ def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[Table]:
             row |= _signal(plan, signal, original, escs)
             signals.append(row)
     return [
-        Table("Messages", [file, _line(comment)], messages),
-        Table("Signals", [_SIGNALS], signals, by="message"),
+        MarkdownTable("Messages", [file, _line(comment)], messages),
+        MarkdownTable("Signals", [_SIGNALS], signals, by="message"),
     ]
 
 
@@ -299,7 +299,7 @@ GATEWAY_STATES: Mapping[GatewayState, Text] = {
 }
 
 
-def values(escs: Sequence[EscSettings]) -> list[Table]:
+def values(escs: Sequence[EscSettings]) -> list[MarkdownTable]:
     """Return tables of every value that a signal or object can show, of errors, states, devices."""
     meanings = meanings_of(escs)
     only_objects = {}
@@ -335,11 +335,11 @@ def values(escs: Sequence[EscSettings]) -> list[Table]:
             operating.append((code, state.text, state))
         devices += [_device(protocol, device) for device in protocol.devices]
     return [
-        Table("Values", _VALUES, rows),
+        MarkdownTable("Values", _VALUES, rows),
         _errors("Operating errors", "Bits of each live frame.", protocols),
         _errors("Selftest errors", "Bits of the info frame, about once a second.", protocols),
         _states("Operating", operating),
-        Table("Devices", [], devices),
+        MarkdownTable("Devices", [], devices),
         _states("Link", _named(LINK_STATES)),
         _states("CAN", _named(CAN_STATES)),
         _states("Gateway", _named(GATEWAY_STATES)),
@@ -383,7 +383,7 @@ def place(index: int, sub: int) -> str:
     return f"{index:04X}h:{sub:02X}"
 
 
-def _errors(title: str, text: str, protocols: Sequence[EscProtocol]) -> Table:
+def _errors(title: str, text: str, protocols: Sequence[EscProtocol]) -> MarkdownTable:
     word = title.lower().replace(" ", "_")
     rows = []
     for protocol in protocols:
@@ -396,10 +396,10 @@ def _errors(title: str, text: str, protocols: Sequence[EscProtocol]) -> Table:
                 "remedy": bit.remedy,
             }
             rows.append(row)
-    return Table(title, [text], rows)
+    return MarkdownTable(title, [text], rows)
 
 
-def _states(title: str, states: Iterable[tuple[int, str, Text | State]]) -> Table:
+def _states(title: str, states: Iterable[tuple[int, str, Text | State]]) -> MarkdownTable:
     rows = []
     for value, name, state in states:
         row = {
@@ -409,7 +409,7 @@ def _states(title: str, states: Iterable[tuple[int, str, Text | State]]) -> Tabl
             "remedy": state.remedy,
         }
         rows.append(row)
-    return Table(f"{title} states", [], rows)
+    return MarkdownTable(f"{title} states", [], rows)
 
 
 def _device(protocol: EscProtocol, device: int) -> Row:

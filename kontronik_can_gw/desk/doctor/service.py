@@ -18,7 +18,7 @@ _WITHOUT_JOURNAL = ("vfat", "msdos", "exfat")
 _UNIT_FOLDERS = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
 
 
-class Unit(NamedTuple):
+class ServiceUnit(NamedTuple):
     """A systemd unit with its properties from `systemctl show`."""
 
     name: str
@@ -31,7 +31,7 @@ class Unit(NamedTuple):
         return f"/var/lib/{name}"
 
 
-def unit_of(machine: Machine, config: str) -> Unit | None:
+def unit_of(machine: Machine, config: str) -> ServiceUnit | None:
     """Return the unit of a configuration file with this absolute path. None if there is none."""
     name = _unit_name(config)
     shown = {}
@@ -40,7 +40,7 @@ def unit_of(machine: Machine, config: str) -> Unit | None:
         shown[key] = value
     if shown.get("LoadState") != "loaded":
         return None
-    return Unit(name, shown)
+    return ServiceUnit(name, shown)
 
 
 def _unit_name(config: str) -> str:
@@ -49,7 +49,9 @@ def _unit_name(config: str) -> str:
     return f"{NAME}@{path.stem}.service" if is_instance else f"{NAME}.service"
 
 
-def check_service(machine: Machine, findings: Findings, unit: Unit | None, config: str) -> None:
+def check_service(
+    machine: Machine, findings: Findings, unit: ServiceUnit | None, config: str
+) -> None:
     """Check if the service is installed, enabled and running, and how often it was restarted."""
     if unit is None:
         units = [f"{folder}/{NAME}.service" for folder in _UNIT_FOLDERS]

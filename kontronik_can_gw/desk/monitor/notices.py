@@ -22,7 +22,7 @@ _TROUBLES = {
 }
 
 
-class Kind(Enum):
+class NoticeKind(Enum):
     """The kind of a notice."""
 
     REPLAY = "replay"
@@ -31,30 +31,30 @@ class Kind(Enum):
     WAITING = "waiting"
 
 
-def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, Kind]]:
+def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, NoticeKind]]:
     """Yield notices about gateway and source with their kinds."""
     frames = f"frames of {monitor.file} on {source.name}"
     if monitor.is_replay and not source.is_file:
         text = "REPLAY: the gateway plays a recording; these are not values of a live ESC."
-        yield text, Kind.REPLAY
+        yield text, NoticeKind.REPLAY
     if source.problem:
-        yield source.problem, Kind.FAULT
+        yield source.problem, NoticeKind.FAULT
     elif source.ended and not monitor.view.frames:
         text = f"{source.name} contains no frame of {monitor.file}."
-        yield f"{text} Give the DBC of its frames (-c, --dbc).", Kind.FAULT
+        yield f"{text} Give the DBC of its frames (-c, --dbc).", NoticeKind.FAULT
     elif monitor.is_quiet:
-        yield "the gateway is quiet: it sends again when an ESC is heard.", Kind.HINT
+        yield "the gateway is quiet: it sends again when an ESC is heard.", NoticeKind.HINT
     elif monitor.silent_ns >= SILENCE_NS and not source.is_file:
-        yield f"no {frames}", Kind.FAULT
+        yield f"no {frames}", NoticeKind.FAULT
         for hint in source.hints:
-            yield hint, Kind.HINT
+            yield hint, NoticeKind.HINT
     elif not monitor.view.frames and not source.is_file:
-        yield f"waiting for {frames} ...", Kind.WAITING
+        yield f"waiting for {frames} ...", NoticeKind.WAITING
     count = monitor.gateway.number("esc_count")
     known = len(monitor.escs)
     if count is not None and count > known:
         text = f"the gateway has {count:.0f} ESCs, but the DBC in use describes {known}. "
-        yield text + "Give its configuration (-c) or DBC (--dbc).", Kind.HINT
+        yield text + "Give its configuration (-c) or DBC (--dbc).", NoticeKind.HINT
 
 
 def link_of(esc: Esc) -> tuple[str, str]:

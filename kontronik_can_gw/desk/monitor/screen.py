@@ -27,7 +27,7 @@ from kontronik_can_gw.desk.monitor.model import (
     Monitor,
     Quantity,
 )
-from kontronik_can_gw.desk.monitor.notices import Kind, link_of, notices, trouble_of
+from kontronik_can_gw.desk.monitor.notices import NoticeKind, link_of, notices, trouble_of
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.desk.words import words
 from kontronik_can_gw.esc.decoder import Severity
@@ -36,10 +36,10 @@ from kontronik_can_gw.runtime.system.fault_log import duration
 from kontronik_can_gw.times import MS
 
 _NOTICE_STYLES = {
-    Kind.REPLAY: "bold black on yellow",
-    Kind.FAULT: "bold red",
-    Kind.HINT: "yellow",
-    Kind.WAITING: "dim",
+    NoticeKind.REPLAY: "bold black on yellow",
+    NoticeKind.FAULT: "bold red",
+    NoticeKind.HINT: "yellow",
+    NoticeKind.WAITING: "dim",
 }
 _FRESH_LINKS = ("ok", "degraded")
 """States of a link with live data."""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import IO
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.desk.parcel.parts import Contents, Part
+from kontronik_can_gw.desk.parcel.parts import BundlePart, Contents
 from kontronik_can_gw.runtime.files.disk import write_all
 from kontronik_can_gw.runtime.status.facts import utc
 from kontronik_can_gw.times import SECOND
@@ -85,7 +85,7 @@ def write_archive(file: IO[bytes], contents: Contents, made_ns: int) -> None:
             raw.restart()
 
 
-def _write(raw: _File, parts: Sequence[Part], contents: Contents, made_ns: int) -> None:
+def _write(raw: _File, parts: Sequence[BundlePart], contents: Contents, made_ns: int) -> None:
     date = time.gmtime(made_ns // SECOND)[:6]
     with zipfile.ZipFile(raw, "w") as archive:  # type: ignore[call-overload]
         for part in parts:

@@ -52,7 +52,7 @@ _LIBRARIES = (
 )
 
 
-class Part(NamedTuple):
+class BundlePart(NamedTuple):
     """A file of the parcel."""
 
     name: str
@@ -67,7 +67,7 @@ class Contents:
 
     def __init__(self, cleaner: Cleaner) -> None:
         self.cleaner = cleaner
-        self.parts: list[Part] = []
+        self.parts: list[BundlePart] = []
         self.missing: list[str] = []
         self.digests: dict[str, str] = {}
         """SHA-256 of each part, and of original files from which nothing was removed."""
@@ -86,7 +86,7 @@ class Contents:
 
     def add(self, name: str, data: bytes) -> None:
         """Add a part whose content has no secrets."""
-        self.parts.append(Part(name, len(data), lambda: [data]))
+        self.parts.append(BundlePart(name, len(data), lambda: [data]))
         self.digests[name] = hashlib.sha256(data).hexdigest()
 
     def add_text(self, name: str, text: str) -> None:
@@ -259,7 +259,7 @@ def _capture(
     path: Path,
     with_dbc: bool,
     watch: Callable[[Iterator[bytes], str], Iterator[bytes]],
-) -> Part:
+) -> BundlePart:
     name = f"captures/{_file_name(path)}"
 
     def chunks() -> Iterator[bytes]:
@@ -269,7 +269,7 @@ def _capture(
             data = watch(data, name)
             yield from clean_capture(data, name, contents.cleaner, with_dbc=with_dbc)
 
-    return Part(name, path.stat().st_size, chunks)
+    return BundlePart(name, path.stat().st_size, chunks)
 
 
 # --- versions

@@ -41,7 +41,7 @@ ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 """Formats that can be written to standard output or a pipe: they are text, written in order."""
 
 
-class Output:
+class OutputFile:
     """The destination of converted data: a file, or standard output if ``target`` is None.
 
     1. A file is written as ``NAME.part`` beside its destination. It is renamed at the end if
@@ -156,7 +156,7 @@ def check_part(part: Path, *, force: bool) -> None:
         )
 
 
-def to_table(recording: "Input", out: Output, form: str, choice: "Choice") -> str | None:
+def to_table(recording: "Input", out: OutputFile, form: str, choice: "Choice") -> str | None:
     """Convert a recording to a table. ``form`` is one of TABLES."""
     from kontronik_can_gw.desk.recordings.fields import Table
     from kontronik_can_gw.desk.recordings.recording import part_of
@@ -191,7 +191,7 @@ def _table_writer(file: IO[bytes], form: str, table: "Table") -> Any:
 
 def to_log(
     recording: "Input",
-    out: Output,
+    out: OutputFile,
     form: str,
     start_ns: int | None = None,
     end_ns: int | None = None,
@@ -229,7 +229,7 @@ def _flush_before_waits(recording: "Input", file: IO[bytes]) -> None:
         recording.stream.before_wait = file.flush
 
 
-def _write_all(writer: Any, items: Iterator[Any], out: Output) -> tuple[int, int]:
+def _write_all(writer: Any, items: Iterator[Any], out: OutputFile) -> tuple[int, int]:
     """Write blocks of rows or batches of frames. Return the number of items and the last time."""
     from kontronik_can_gw.desk.recordings.recording import time_at
 
@@ -248,7 +248,7 @@ def _write_all(writer: Any, items: Iterator[Any], out: Output) -> tuple[int, int
     return count, last_ns
 
 
-def to_bytes(recording: "Input", out: Output, esc: int) -> str | None:
+def to_bytes(recording: "Input", out: OutputFile, esc: int) -> str | None:
     """Convert a recording to the plain bytes of one ESC."""
     file = out.open()
     _flush_before_waits(recording, file)

@@ -41,7 +41,7 @@ class ColumnType(Enum):
 
 
 @dataclass(frozen=True)
-class Field:
+class TableColumn:
     """A column of a table. Its values are read from CAN frames or from the bytes of an ESC."""
 
     name: str
@@ -95,7 +95,7 @@ class Field:
 class Table:
     """The description of a table."""
 
-    fields: Sequence[Field]
+    fields: Sequence[TableColumn]
     has_utc: bool
     """True if the rows have Unix times."""
     has_trust: bool = False
@@ -105,7 +105,7 @@ class Table:
     provenance: Mapping[str, str] = field(default_factory=dict)
 
 
-def fields_of_values(escs: Sequence[EscSettings]) -> list[Field]:
+def fields_of_values(escs: Sequence[EscSettings]) -> list[TableColumn]:
     """Return a field for each value of all ESCs, followed by those of the gateway.
 
     If there are several ESCs, their names precede the values' names: ``esc1.battery_voltage``.
@@ -126,7 +126,7 @@ def _fields_of_group(
     group: Group,
     prefix: str,
     esc: int | None,
-) -> list[Field]:
+) -> list[TableColumn]:
     return [
         _field(value, prefix, esc)
         for value in values
@@ -134,7 +134,7 @@ def _fields_of_group(
     ]
 
 
-def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
+def _field(value: EscValue, prefix: str, esc: int | None) -> TableColumn:
     high = math.inf if value.high is None else value.high / value.per_unit
     kind = ColumnType.FLOAT
     if value.names:
@@ -143,7 +143,7 @@ def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
         kind = ColumnType.FLAG
     elif value.per_unit == 1 and value.divisor is Divisor.ONE:
         kind = ColumnType.WHOLE
-    return Field(
+    return TableColumn(
         name=prefix + value.name,
         unit=value.unit,
         kind=kind,
@@ -155,7 +155,7 @@ def _field(value: EscValue, prefix: str, esc: int | None) -> Field:
     )
 
 
-def distinct(fields: Sequence[Field]) -> list[Field]:
+def distinct(fields: Sequence[TableColumn]) -> list[TableColumn]:
     """Return the fields with distinct names.
 
     If several fields have a name, or the table itself uses it, the message precedes it:
@@ -164,7 +164,7 @@ def distinct(fields: Sequence[Field]) -> list[Field]:
     counts = Counter(one.name for one in fields)
     within = Counter((one.message, one.name) for one in fields)
 
-    def name_of(one: Field) -> str:
+    def name_of(one: TableColumn) -> str:
         if within[one.message, one.name] > 1:
             return f"{one.message}.{one.signal or one.name}"
         if counts[one.name] > 1 or one.name in _OWN:
@@ -174,7 +174,7 @@ def distinct(fields: Sequence[Field]) -> list[Field]:
     return [replace(one, name=name_of(one)) for one in fields]
 
 
-def column_of(fields: Sequence[Field], source: str, esc: int | None) -> int | None:
+def column_of(fields: Sequence[TableColumn], source: str, esc: int | None) -> int | None:
     """Return the index of the first field with a value of values.py. None if there is none."""
     for index, one in enumerate(fields):
         if one.source == source and one.esc == esc:
@@ -191,7 +191,7 @@ class Choice:
     end_ns: int | None = None
 
     @classmethod
-    def of(cls, fields: Sequence[Field], names: Sequence[str] = (), **times: Any) -> "Choice":
+    def of(cls, fields: Sequence[TableColumn], names: Sequence[str] = (), **times: Any) -> "Choice":
         """Choose the fields with one of these names, which may contain ``*`` and ``?``.
 
         Case, underscores, dots and a final ``Percent`` do not matter. The name of an ESC may be
@@ -220,7 +220,7 @@ class Choice:
         return cls([*chosen], **times)
 
 
-def _possible_names(field: Field) -> set[str]:
+def _possible_names(field: TableColumn) -> set[str]:
     """Return the names by which a user can choose a field."""
     without_esc = field.name.rpartition(".")[2]
     return {_plain(field.name), _plain(without_esc), _plain(field.signal)} - {""}

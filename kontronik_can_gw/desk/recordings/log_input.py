@@ -8,17 +8,17 @@ from pathlib import Path
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.can_logs import asc, text
-from kontronik_can_gw.desk.recordings.fields import Field
+from kontronik_can_gw.desk.recordings.fields import TableColumn
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.log_clock import LogClock
 from kontronik_can_gw.desk.recordings.recording import (
     ERROR,
     LATEST_NS,
     ROWS,
-    Block,
     ClockStep,
     Input,
     LogFrame,
+    RowBlock,
     Sample,
 )
 from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
@@ -210,16 +210,16 @@ class CanLogInput(Input):
         return found
 
     @cached_property
-    def fields(self) -> Sequence[Field]:
+    def fields(self) -> Sequence[TableColumn]:
         return fields_of_log(self.reader, self.bus.escs)
 
-    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
+    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock]:
         if chosen is None:
             chosen = range(len(self.fields))
         rows = RowsOfFrames(self.reader, chosen)
         count = ROWS if self.stream is None else 1
         for times, columns in rows.blocks(self._data_frames(), count):
-            yield Block(times, columns, self.wall_offset_ns(times[0]))
+            yield RowBlock(times, columns, self.wall_offset_ns(times[0]))
 
     def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
         return self.samples(chosen)

@@ -16,9 +16,9 @@ from kontronik_can_gw.capture.format import Entry
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.core.output import Output, OutputHost
 from kontronik_can_gw.core.output_setup import OutputMaker, ReadyOutput
-from kontronik_can_gw.desk.recordings.fields import Field
+from kontronik_can_gw.desk.recordings.fields import TableColumn
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.recordings.recording import Block, Input, PlayedBlock, Sample, timed
+from kontronik_can_gw.desk.recordings.recording import Input, PlayedBlock, RowBlock, Sample, timed
 from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native import load
@@ -36,7 +36,7 @@ class _RowOutput:
 
     slots = 0
 
-    def __init__(self, fields: Sequence[Field]) -> None:
+    def __init__(self, fields: Sequence[TableColumn]) -> None:
         self._fields = fields
         self.maker: RowMaker
 
@@ -101,7 +101,7 @@ class PlayedInput(Input):
             yield from rows.maker.take_rows()
         yield from rows.maker.finish()
 
-    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
+    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock]:
         fields = self.fields
         if chosen is not None:
             fields = [self.fields[index] for index in chosen]
@@ -110,7 +110,7 @@ class PlayedInput(Input):
             return super().blocks(chosen)
         return self._played(*found)
 
-    def _played(self, gateway: Gateway, player: "Player") -> Iterator[Block]:
+    def _played(self, gateway: Gateway, player: "Player") -> Iterator[RowBlock]:
         done = 0
         for _ in self._play(gateway, player):
             if player.is_full:
@@ -122,7 +122,7 @@ class PlayedInput(Input):
                 done = rows.count
         yield from self._timed(player.take_rows(final=True), done)
 
-    def _timed(self, rows: "Rows", begin: int) -> Iterator[Block]:
+    def _timed(self, rows: "Rows", begin: int) -> Iterator[RowBlock]:
         """Yield the rows from ``begin`` in blocks during which the wall clock was not set."""
         edges = {begin, rows.count}
         for since_ns, _ in self._offsets:
@@ -146,7 +146,7 @@ class PlayedInput(Input):
         return Gateway(escs, NO_MESSAGES, self.created_ns, outputs=[*changing, *readers])
 
     def _player_of(
-        self, make: Callable[[Sequence[OutputMaker]], Gateway], fields: Sequence[Field] | None
+        self, make: Callable[[Sequence[OutputMaker]], Gateway], fields: Sequence[TableColumn] | None
     ) -> "tuple[Gateway, Player] | None":
         """Return a gateway and the player of its C core. None if only the Python core can play it.
 

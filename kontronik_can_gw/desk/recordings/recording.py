@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
 
 from kontronik_can_gw.capture.replay import TimedFrame
-from kontronik_can_gw.desk.recordings.fields import Field, fields_of_values
+from kontronik_can_gw.desk.recordings.fields import TableColumn, fields_of_values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.stream import Stream
 from kontronik_can_gw.desk.recordings.trusted_times import TrustedTimes
@@ -81,7 +81,7 @@ class Sample(NamedTuple):
     values: tuple[Value, ...]
 
 
-class Block:
+class RowBlock:
     """Rows, stored as columns.
 
     ``times`` are ns of the recording's clock and do not decrease. A time plus ``wall_ns`` is Unix
@@ -109,12 +109,12 @@ class Block:
         """Values of each column, None where not available."""
         return self._columns
 
-    def part(self, begin: int, end: int) -> "Block":
+    def part(self, begin: int, end: int) -> "RowBlock":
         """Return the rows from index ``begin`` up to ``end``, which is not included."""
         if (begin, end) == (0, len(self)):
             return self
         columns = [column[begin:end] for column in self._columns]
-        return Block(self.times[begin:end], columns, self.wall_ns, self.is_trusted)
+        return RowBlock(self.times[begin:end], columns, self.wall_ns, self.is_trusted)
 
     def between(self, low_ns: int, high_ns: int) -> Self:
         """Return the rows from one time to another, both included."""
@@ -127,7 +127,7 @@ class Block:
         return map(Sample, self.times, values)
 
 
-class PlayedBlock(Block):
+class PlayedBlock(RowBlock):
     """Rows ``begin`` to ``end`` of the ``Rows`` that the C core made."""
 
     def __init__(
@@ -243,7 +243,7 @@ class Input(ABC):
         return SignalReader(self.bus.layout)
 
     @cached_property
-    def fields(self) -> Sequence[Field]:
+    def fields(self) -> Sequence[TableColumn]:
         """The columns of the rows: values by name."""
         return fields_of_values(self.bus.escs)
 
@@ -264,7 +264,7 @@ class Input(ABC):
     def batches(self) -> "Iterator[Batch]":
         """Yield the frames for a log in batches, of all channels unless one was selected."""
 
-    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[Block]:
+    def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock]:
         """Yield rows of the values of the ``chosen`` fields, in that order. None: of all fields."""
         if chosen is None:
             chosen = range(len(self.fields))
@@ -276,7 +276,7 @@ class Input(ABC):
             for (wall_ns, is_trusted), group in groupby(some, itemgetter(0)):
                 _, times, values = zip(*group, strict=True)
                 columns = [*zip(*values, strict=True)]
-                yield Block(times, columns, wall_ns, is_trusted)
+                yield RowBlock(times, columns, wall_ns, is_trusted)
 
     def _clock_at(self, time_ns: int) -> tuple[int | None, bool | None]:
         return self.wall_offset_ns(time_ns), self.trust.at(time_ns)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.dbc.view import Freshness
-from kontronik_can_gw.desk.recordings.fields import ColumnType, Field, Read, distinct
+from kontronik_can_gw.desk.recordings.fields import ColumnType, Read, TableColumn, distinct
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, LogFrame, Sample
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group, Kind
@@ -46,7 +46,7 @@ class RowMaker(Output):
 
     def __init__(
         self,
-        fields: Sequence[Field],
+        fields: Sequence[TableColumn],
         escs: Sequence[EscTelemetry],
         status: GatewayStatus,
         now: int,
@@ -132,7 +132,7 @@ class RowMaker(Output):
 # --- from CAN frames
 
 
-def fields_of_log(reader: SignalReader, escs: Sequence[EscSettings]) -> list[Field]:
+def fields_of_log(reader: SignalReader, escs: Sequence[EscSettings]) -> list[TableColumn]:
     """Return a field for each signal of a layout.
 
     It has the name and the unit of the value to which the signal is bound.
@@ -156,7 +156,7 @@ def fields_of_log(reader: SignalReader, escs: Sequence[EscSettings]) -> list[Fie
             kind = ColumnType.FLAG
         elif column.is_whole:
             kind = ColumnType.WHOLE
-        field = Field(
+        field = TableColumn(
             name=prefix + column.source,
             unit=unit,
             kind=kind,

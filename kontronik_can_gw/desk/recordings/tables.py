@@ -14,8 +14,15 @@ from itertools import repeat
 from typing import IO, TYPE_CHECKING, Any
 
 from kontronik_can_gw.desk.libraries import missing_library
-from kontronik_can_gw.desk.recordings.fields import TIME, TRUSTED, UTC, ColumnType, Field, Table
-from kontronik_can_gw.desk.recordings.recording import Block, PlayedBlock
+from kontronik_can_gw.desk.recordings.fields import (
+    TIME,
+    TRUSTED,
+    UTC,
+    ColumnType,
+    Table,
+    TableColumn,
+)
+from kontronik_can_gw.desk.recordings.recording import PlayedBlock, RowBlock
 from kontronik_can_gw.native import load
 from kontronik_can_gw.times import SECOND
 
@@ -128,7 +135,7 @@ class TextTable:
         line = ",".join(map(csv_text, heads)) + "\n"
         file.write(line.encode())
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Add rows."""
         wall_ns = block.wall_ns or 0
         if not isinstance(block, PlayedBlock) or block.times[0] + wall_ns < 0:
@@ -144,7 +151,7 @@ class TextTable:
             else:
                 self._file.write(piece)
 
-    def _write(self, block: Block) -> None:
+    def _write(self, block: RowBlock) -> None:
         wall_ns = block.wall_ns or 0
         after_utc = self._after_utc(block.is_trusted)
         heads = map(self._head_of_line, block.times, repeat(wall_ns), repeat(after_utc))
@@ -266,7 +273,7 @@ class ParquetTable:
         self._batches: list[Any] = []
         self._held = 0
 
-    def write(self, block: Block) -> None:
+    def write(self, block: RowBlock) -> None:
         """Add rows."""
         pa = self._pa
         compute = self._compute
@@ -307,7 +314,7 @@ class ParquetTable:
         with suppress(OSError):  # there is no room for its end
             self._writer.close()
 
-    def _played(self, block: PlayedBlock, index: int, one: Field) -> Any:
+    def _played(self, block: PlayedBlock, index: int, one: TableColumn) -> Any:
         """Return a column of the C core without copying it."""
         pa = self._pa
         made = block.made
@@ -333,7 +340,7 @@ class ParquetTable:
             self._held = 0
             self._writer.write_table(table.unify_dictionaries(), GROUP)
 
-    def _type(self, one: Field) -> Any:
+    def _type(self, one: TableColumn) -> Any:
         pa = self._pa
         if one.kind is ColumnType.TEXT:
             return pa.dictionary(pa.int32(), pa.string())

@@ -11,7 +11,7 @@ from math import isfinite
 from operator import ne
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.desk.recordings.fields import ColumnType, Field
+from kontronik_can_gw.desk.recordings.fields import ColumnType, TableColumn
 from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
 from kontronik_can_gw.desk.report.quantities import (
     COMPUTED_FROM,
@@ -72,7 +72,7 @@ class EscFlight:
     """The results of one ESC. A number is None if the recording does not have it."""
 
     def __init__(
-        self, index: int, settings: EscSettings, fields: Sequence[Field], events: FlightEvents
+        self, index: int, settings: EscSettings, fields: Sequence[TableColumn], events: FlightEvents
     ) -> None:
         self.name = settings.name
         self.telemetry_ns = 0
@@ -355,7 +355,7 @@ class EscFlight:
         self._held = (since_ns, has_telemetry, last_power, last_speed)
 
 
-def _first_fields(fields: Sequence[Field], esc: int) -> dict[str, int]:
+def _first_fields(fields: Sequence[TableColumn], esc: int) -> dict[str, int]:
     """Return the index of the first field of each source of an ESC."""
     found: dict[str, int] = {}
     for index, field in enumerate(fields):
@@ -391,7 +391,7 @@ def _error_columns(protocol: EscProtocol, columns: Container[str]) -> list[_Erro
     return found
 
 
-def _float_signals(fields: Iterable[Field]) -> set[str]:
+def _float_signals(fields: Iterable[TableColumn]) -> set[str]:
     """Return the values that are floats in CAN frames."""
     found = set()
     for field in fields:
@@ -423,7 +423,7 @@ def _power(voltage: Number, current: Number) -> Number:
     return round(voltage * current, 3)
 
 
-def _values_to_compute(fields: Sequence[Field]) -> set[str]:
+def _values_to_compute(fields: Sequence[TableColumn]) -> set[str]:
     """Return the values in CAN frames that are less frequent than the values they follow from."""
     periods = {field.source: field.period_ns for field in fields}
     found = set()

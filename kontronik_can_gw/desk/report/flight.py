@@ -10,8 +10,8 @@ from itertools import compress, islice, pairwise
 from operator import ne
 from typing import NamedTuple
 
-from kontronik_can_gw.desk.recordings.fields import Field, column_of
-from kontronik_can_gw.desk.recordings.recording import LATEST_NS, Block
+from kontronik_can_gw.desk.recordings.fields import TableColumn, column_of
+from kontronik_can_gw.desk.recordings.recording import LATEST_NS, RowBlock
 from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight, Number
 from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
 from kontronik_can_gw.desk.report.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
@@ -48,7 +48,7 @@ for _protocol in PROTOCOLS:
     _SOURCES.update(_protocol.errors, _protocol.bits)
 
 
-def needed_columns(fields: Sequence[Field]) -> list[int]:
+def needed_columns(fields: Sequence[TableColumn]) -> list[int]:
     """Return the indices of the fields that a flight needs.
 
     Flags are not needed if the recording has the error word that contains them.
@@ -80,7 +80,7 @@ class Flight:
     def __init__(
         self,
         escs: Sequence[EscSettings],
-        fields: Sequence[Field],
+        fields: Sequence[TableColumn],
         points: int = 20_000,
         window: tuple[float | None, float | None] = (None, None),
     ) -> None:
@@ -129,7 +129,7 @@ class Flight:
         """True if the fields have a value that can be drawn."""
         return bool(self._drawn)
 
-    def evaluate(self, block: Block) -> bool:
+    def evaluate(self, block: RowBlock) -> bool:
         """Evaluate rows. Return False if all later rows are after the window."""
         if not self._has_begun:
             self._has_begun = True
@@ -146,7 +146,7 @@ class Flight:
             if not self.rows and not row:
                 self.start_ns = time_ns
             elif time_ns - self.end_ns > self._gap_ns:
-                blank_row = Block([self.end_ns], self._blank, None)
+                blank_row = RowBlock([self.end_ns], self._blank, None)
                 self._analyse(rows.part(begin, row))
                 self._analyse(blank_row)
                 begin = row
@@ -155,7 +155,7 @@ class Flight:
         self._analyse(rows.part(begin, len(rows)))
         return block.times[-1] <= high
 
-    def _without_long_gaps(self, block: Block) -> Block:
+    def _without_long_gaps(self, block: RowBlock) -> RowBlock:
         """Return the rows with their times on the page."""
         times: Sequence[int] = block.times
         last_ns = self._last_ns
@@ -172,7 +172,7 @@ class Flight:
                 self._cut_ns += length_ns
             moved.append(time_ns - self._cut_ns)
             last_ns = time_ns
-        return Block(moved, block.columns, None)
+        return RowBlock(moved, block.columns, None)
 
     def finish(self) -> "Flight":
         """Make ``lines`` and ``events``. Must be called after the last row."""
@@ -202,7 +202,7 @@ class Flight:
                 return False
         return has_both
 
-    def _analyse(self, rows: Block) -> None:
+    def _analyse(self, rows: RowBlock) -> None:
         if not len(rows):
             return
         times = rows.times

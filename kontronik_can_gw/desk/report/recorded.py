@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable
 
 from kontronik_can_gw.desk.recordings.inputs import Input
-from kontronik_can_gw.desk.recordings.recording import Block
+from kontronik_can_gw.desk.recordings.recording import RowBlock
 from kontronik_can_gw.desk.report.flight import Flight, needed_columns
 from kontronik_can_gw.errors import UserError
 
@@ -11,7 +11,7 @@ from kontronik_can_gw.errors import UserError
 def flight_of(
     recording: Input,
     window: tuple[float | None, float | None] = (None, None),
-    watch: Callable[[Iterable[Block]], Iterable[Block]] = iter,
+    watch: Callable[[Iterable[RowBlock]], Iterable[RowBlock]] = iter,
 ) -> Flight:
     """Return the flight after all rows of the window. All blocks pass through ``watch``.
 

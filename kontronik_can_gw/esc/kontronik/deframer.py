@@ -60,7 +60,7 @@ class Frame(Reading):
 
 
 @dataclass(slots=True)
-class Counters:
+class DeframerCounters:
     """Counts of one stream.
 
     Every byte fed is part of a frame, counted as dropped under one reason, or still pending.
@@ -118,15 +118,15 @@ class Counters:
         totals = {"live": self.live, "info": self.info, "dropped_bytes": self.dropped_bytes}
         return totals | dict(zip(_NAMES, _get_all(self), strict=True))
 
-    def copy(self) -> "Counters":
-        return Counters(*_get_all(self))
+    def copy(self) -> "DeframerCounters":
+        return DeframerCounters(*_get_all(self))
 
-    def diagnosis(self, since: "Counters | None" = None) -> str | None:
+    def diagnosis(self, since: "DeframerCounters | None" = None) -> str | None:
         """Explain in words why no frame was received since the earlier state ``since``.
 
         Without ``since``, since the start of the stream. None if a frame was received.
         """
-        old = since or Counters()
+        old = since or DeframerCounters()
         if self.live + self.info > old.live + old.info:
             return None
         received = self.bytes - old.bytes
@@ -163,7 +163,7 @@ class Counters:
         )
 
 
-_NAMES = tuple(f.name for f in fields(Counters))
+_NAMES = tuple(f.name for f in fields(DeframerCounters))
 _get_all = attrgetter(*_NAMES)
 
 
@@ -182,7 +182,7 @@ class Deframer:
     __slots__ = ("_base", "_held", "_needed", "_rejected_for", "_rejected_until", "counters")
 
     def __init__(self) -> None:
-        self.counters = Counters()
+        self.counters = DeframerCounters()
         self._held = b""
         """The undecided bytes."""
         self._base = 0
@@ -218,7 +218,7 @@ class Deframer:
         self._rejected_until = self._base
         return frames
 
-    def adopt_counters(self, counters: Counters) -> None:
+    def adopt_counters(self, counters: DeframerCounters) -> None:
         """Replace the counters. They must agree with the bytes that are held."""
         shift = counters.bytes - self.counters.bytes
         self._base += shift

@@ -3,7 +3,7 @@
 1. Takes time as whole ns and returns frames. Does not block, read a clock or do I/O.
 2. The same options, seed and start give the same bytes, however the calls are spaced.
 3. The faults of the line do not change the data, only the bytes on the wire. Each frame is returned
-   as a ``Sent``, which has both.
+   as a ``SimulatedFrame``, which has both.
 
 The flight is synthetic. These details are as in recorded frames: the idle error word (bit 17 set),
 state 12 when idle, a logged maximum battery voltage of 0.00 V before the motor has run, the peak
@@ -296,7 +296,7 @@ def usual_layout(device: Device) -> WireLayout:
     return WireLayout.LEGACY if device is Device.JIVEPRO else WireLayout.V4
 
 
-class Sent(NamedTuple):
+class SimulatedFrame(NamedTuple):
     """A frame before and after the faults of the line."""
 
     time_ns: int
@@ -342,16 +342,16 @@ class SimulatedEsc:
         self._faults = faults
         self._flips = Random(f"flips {seed}").random
 
-    def frames_until(self, now_ns: int) -> list[Sent]:
+    def frames_until(self, now_ns: int) -> list[SimulatedFrame]:
         """Return the frames up to and including ``now_ns`` that were not returned yet, in order."""
-        frames: list[Sent] = []
+        frames: list[SimulatedFrame] = []
         while self.next_ns <= now_ns:
             sent = self._make_next_frame()
             if sent is not None:
                 frames.append(sent)
         return frames
 
-    def _make_next_frame(self) -> Sent | None:
+    def _make_next_frame(self) -> SimulatedFrame | None:
         """Return the frame due at ``next_ns``, or None in a dropout. Update ``next_ns``."""
         now_ns = self.next_ns
         since_start = now_ns - self._start_ns
@@ -377,7 +377,7 @@ class SimulatedEsc:
             if since_start % interval >= interval - duration:
                 return None
         frame = encode(data, self.layout)
-        return Sent(now_ns, data, frame, self._flip_bits(frame))
+        return SimulatedFrame(now_ns, data, frame, self._flip_bits(frame))
 
     def _plug_in(self, swap: Swap) -> None:
         self.device = swap.device

@@ -19,7 +19,7 @@ from kontronik_can_gw.runtime.ports.serial_port import (
     device_of,
     is_mini_uart,
 )
-from kontronik_can_gw.runtime.ports.usb_adapters import Identity, find_adapter, identity_at
+from kontronik_can_gw.runtime.ports.usb_adapters import UsbIdentity, find_adapter, identity_at
 from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.status.facts import PortFacts
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
@@ -56,7 +56,7 @@ class EscPort:
     ) -> None:
         self.path = path
         self.port: SerialPort | None = None
-        self.identity: Identity | None = None
+        self.identity: UsbIdentity | None = None
         self.reopened = -1
         """Number of times that the port was opened again. -1 before it was opened at all."""
         self.due = 0
@@ -94,7 +94,7 @@ class EscPort:
             self.log.diagnosis,
         )
 
-    def open(self, now: int, wait: bool, others: tuple[Identity | None, ...] = ()) -> None:
+    def open(self, now: int, wait: bool, others: tuple[UsbIdentity | None, ...] = ()) -> None:
         """Open the port.
 
         Raises RunError if that fails. With ``wait`` it raises nothing, and ``reopen`` tries again.
@@ -177,7 +177,7 @@ class EscPort:
                 noted.undrained_ns = min(now, transmitted_ns)
             self._gateway.receive_bytes(self._index, data, now, since)
 
-    def reopen(self, now: int, others: tuple[Identity | None, ...] = ()) -> None:
+    def reopen(self, now: int, others: tuple[UsbIdentity | None, ...] = ()) -> None:
         """Open a lost port again if the next attempt is due."""
         if self in self._lost and now >= self.due:
             self.open(now, True, others)
@@ -235,7 +235,7 @@ class EscPort:
             self.log.port_condition, f"{self.name}: {reason} Trying again.", now, quiet=quiet
         )
 
-    def _path_now(self, others: tuple[Identity | None, ...]) -> str:
+    def _path_now(self, others: tuple[UsbIdentity | None, ...]) -> str:
         """Return the present path of the port.
 
         An adapter that was unplugged may get another device number when it is plugged in again.

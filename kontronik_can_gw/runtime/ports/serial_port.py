@@ -21,7 +21,7 @@ import serial
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.decoder import EscProtocol
-from kontronik_can_gw.runtime.ports.usb_adapters import Identity, identity_at
+from kontronik_can_gw.runtime.ports.usb_adapters import UsbIdentity, identity_at
 
 READ_SIZE = 4096
 
@@ -160,7 +160,7 @@ class SerialPort:
         (count,) = _WAITING.unpack(answer)
         return bool(count)
 
-    def identity(self) -> Identity | None:
+    def identity(self) -> UsbIdentity | None:
         """Return the identity of the port's USB adapter, or None for another kind of port."""
         return identity_at(self._real_path)
 

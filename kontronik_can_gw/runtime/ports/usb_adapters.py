@@ -9,7 +9,7 @@ from typing import NamedTuple
 from serial.tools.list_ports_linux import SysFS
 
 
-class Identity(NamedTuple):
+class UsbIdentity(NamedTuple):
     """The properties that identify a USB adapter under any device number."""
 
     vendor: int
@@ -19,7 +19,7 @@ class Identity(NamedTuple):
     """The interface of the adapter, or its whole USB location if it has no serial number."""
 
 
-def identity_at(path: str) -> Identity | None:
+def identity_at(path: str) -> UsbIdentity | None:
     """Return the identity of the USB adapter to which a path leads now, or None."""
     real = os.path.realpath(path.partition("@")[0])
     for device, identity in adapters():
@@ -28,7 +28,7 @@ def identity_at(path: str) -> Identity | None:
     return None
 
 
-def find_adapter(identity: Identity) -> str | None:
+def find_adapter(identity: UsbIdentity) -> str | None:
     """Return the present path of an adapter, for example /dev/ttyUSB1.
 
     None if it is not plugged in, or if two adapters have this identity.
@@ -37,7 +37,7 @@ def find_adapter(identity: Identity) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def adapters() -> Iterator[tuple[str, Identity]]:
+def adapters() -> Iterator[tuple[str, UsbIdentity]]:
     """Yield path and identity of each USB serial adapter that is plugged in.
 
     The loop waits for this function, so other kinds of ports are not queried.
@@ -53,4 +53,4 @@ def adapters() -> Iterator[tuple[str, Identity]]:
                 if serial_number:
                     # An adapter with several ports has one serial number for all of them.
                     place = place.partition(":")[2]
-                yield str(path), Identity(found.vid, found.pid, serial_number, place)
+                yield str(path), UsbIdentity(found.vid, found.pid, serial_number, place)

@@ -1,8 +1,8 @@
 """Runs work that may wait for a disk, a driver or a reader in threads beside the loop.
 
-Any thread may use ``Handover`` and ``Faults``. The functions ``work``, ``wait``, ``failed`` and
-``ended`` that are given to a ``Worker`` run in its thread. Its methods may only be called by its
-owner, except ``put``, which any thread may call.
+Any thread may use ``Handover`` and ``WorkerFaults``. The functions ``work``, ``wait``, ``failed``
+and ``ended`` that are given to a ``Worker`` run in its thread. Its methods may only be called by
+its owner, except ``put``, which any thread may call.
 """
 
 import contextlib
@@ -112,7 +112,7 @@ class Report(NamedTuple):
     text: str
 
 
-class Faults:
+class WorkerFaults:
     """Collects reports of a worker's faults for the fault log: one at the begin, one at the end."""
 
     def __init__(self) -> None:
@@ -157,7 +157,7 @@ class Worker(Generic[Item]):
         capacity: int = sys.maxsize,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.faults = Faults()
+        self.faults = WorkerFaults()
         """The faults that the work reports."""
         self.busy_since: int | None = None
         """Start of the present call of ``work``, by ``clock``. None between calls."""
