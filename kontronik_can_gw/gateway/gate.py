@@ -27,7 +27,7 @@ from kontronik_can_gw.gateway.gate_table import (
 )
 from kontronik_can_gw.times import MS, NEVER
 
-_POLL_NS = 2 * MS
+POLL_NS = 2 * MS
 """Time between two looks while frames are limited, and between two attempts on a busy port."""
 _OPEN = State.OPEN  # an enumeration's members are slow to look up
 _NO_ROWS: tuple[Row, ...] = ()
@@ -124,7 +124,7 @@ class Gate(GateState):
         elif is_full:
             self.retry_due = max(now, self.refused_since + LASTING_NS)
         else:
-            self.retry_due = now + _POLL_NS
+            self.retry_due = now + POLL_NS
         self._step(Event.REFUSED, now)
 
     def made_room(self) -> None:
@@ -259,11 +259,11 @@ class Gate(GateState):
         if state in NO_PORT:
             return NEVER
         if state is State.SLOW or state is State.MOVING:
-            return now + _POLL_NS
+            return now + POLL_NS
         if state is State.FIRST:
             assert self.first.at is not None
             is_soon = now - self.first.at < SOON_NS
-            return now + (_POLL_NS if is_soon else self.quarter_ns)
+            return now + (POLL_NS if is_soon else self.quarter_ns)
         if state is State.RESTARTING and self.is_off:
             return NEVER
         if state in HELD and self.is_quiet:

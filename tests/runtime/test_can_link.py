@@ -4,7 +4,7 @@ Time is passed in. The port and the kernel are scripted.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -94,17 +94,23 @@ class Kernel:
 
 
 class Bench:
+    port_blocks = False
+    """True if the interface takes frames that do not leave it, each time it is opened."""
+
     def __init__(
         self,
         kernel: Kernel,
         self_start: bool = True,
         has_node: bool = True,
+        dbc: Mapping[str, object] | None = None,
+        nodes: int = 1,
         **can: object,
     ) -> None:
         tables = {
             "canopen": {"enabled": has_node, "self_start": self_start, "store": "/nowhere"},
-            "esc": [{"port": "p"}],
+            "esc": [{"port": f"p{number}"} for number in range(nodes)],
             "can": can,
+            "dbc": dbc or {},
         }
         loaded = assemble(parse(tables, "test"))
         self.gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
@@ -145,8 +151,13 @@ class Bench:
         for _ in range(ms):
             self.now += MS
             self.clock = self.now
+            if self.can.port is not None:
+                self.port.let_pass(MS)
             self.can.hear(self.now)
             self.can.reopen(self.now)
+            if self.port_blocks and self.can.port is not None and not self.port.frame_ns:
+                self.port.frame_ns = MS // 4
+                self.port.block()
             if self.now >= self.can.controller.due:
                 self.can.ask(self.now)
             self.can.look(self.now)

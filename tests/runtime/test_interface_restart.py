@@ -227,6 +227,7 @@ def test_an_ordinary_user_is_told_that_nobody_follows_the_request(
     it.hang()
     it.run(5, restarts=False)
     assert "Enable the unit: sudo systemctl enable --now" in caplog.text
+    it.bench.can.close()
     it = Hung(kernel)
     it.hang()
     caplog.clear()
