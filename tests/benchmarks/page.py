@@ -101,7 +101,7 @@ class Feeder:
                             temperature = 20 + next(values) % 50
                             self.steps.append((time.time(), temperature))
                             bus.send(_FRAME.pack(_STATUS, 8, _with(status, temperature)))
-                            next_step += 0.4 + rng.random() * 0.3
+                            next_step = time.monotonic() + 0.4 + rng.random() * 0.3
                         if self._is_stopped.is_set():
                             return
                     data = frame.data
@@ -148,11 +148,12 @@ def _drain(address: str, is_stopped: threading.Event) -> None:
                 sock.recv(1 << 16)
 
 
-def _latencies(steps: list[tuple[float, int]], shown: list[list[float]]) -> list[float]:
-    """Return the time in ms from each step to its figure. Every step must have been shown."""
+def _latencies(steps: list[tuple[float, int]], noted: list[list[float]]) -> list[float]:
+    """Return the time in ms from each step until its figure or a later one was shown."""
     found = []
-    for sent, value in steps:
-        seen = [at for at, text in shown if text == value and at / 1000 >= sent - 0.01]
+    for index, (sent, value) in enumerate(steps):
+        values = {later for _, later in steps[index : index + 10]}
+        seen = [at for at, shown in noted if shown in values and at / 1000 >= sent - 0.01]
         if not seen:
             raise RuntimeError(f"the step to {value} was not shown")
         found.append(seen[0] - sent * 1000)
