@@ -14,6 +14,7 @@ from kontronik_can_gw.assembly.this_machine import ThisMachine, parameter_folder
 from kontronik_can_gw.config.keys import Config, EscConfig
 from kontronik_can_gw.config.parse import examine
 from kontronik_can_gw.core.output_setup import OUTPUTS, HostMachine, OutputSetup, setup_module
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.prepare import (
     check_load,
     prepare,
@@ -83,6 +84,19 @@ class Loaded:
     """Content of the DBC file."""
     outputs: tuple[OutputSetup, ...] = ()
     """Setups of the outputs that send other frames than those of the DBC."""
+
+    @property
+    def core_settings(self) -> CoreSettings:
+        return core_settings(self.escs, self.layout, self.config)
+
+
+def core_settings(
+    escs: Sequence[EscSettings],
+    layout: Layout,
+    config: Config,
+) -> CoreSettings:
+    """Return the settings of the core according to a configuration."""
+    return CoreSettings(escs, layout, config.dbc.silent_on_loss, config.can.quiet_after_ns)
 
 
 def load_configuration(

@@ -43,6 +43,7 @@ from kontronik_can_gw.core.header_parts import (
     whole_number,
 )
 from kontronik_can_gw.core.output_setup import OUTPUTS, OutputSetup, setup_module
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
@@ -182,8 +183,9 @@ class CaptureSetup:
 
     def gateway(self, layout: Layout, now: int) -> Gateway:
         """Return the gateway in its state before the start."""
-        silent_on_loss = self.dbc_settings.silent_on_loss
-        return Gateway(self.escs, layout, now, silent_on_loss, self.outputs, self.quiet_after_ns)
+        is_silent = self.dbc_settings.silent_on_loss
+        settings = CoreSettings(self.escs, layout, is_silent, self.quiet_after_ns)
+        return Gateway(settings, now, self.outputs)
 
 
 def _outputs_of(header: Header, escs: Sequence[EscSettings]) -> tuple[OutputSetup, ...]:

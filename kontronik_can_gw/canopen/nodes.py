@@ -20,6 +20,7 @@ from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSetup
 from kontronik_can_gw.core.output import LogLine, NodeOutput, NodeState, OutputHost, Owner
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.plan import Layout, classic_bits
@@ -447,7 +448,7 @@ def nodes_alone(
     ``message_ids`` are the 11-bit ids that messages use, with their names.
     """
     no_messages = Layout("", "", ())
-    core = PythonCore(escs, no_messages, 0, silent_on_loss=False)
+    core = PythonCore(CoreSettings(escs, no_messages), 0)
     for can_id, name in message_ids.items():
         core.own_ids[can_id] = Owner(None, name)
     return Nodes(setups, core)

@@ -165,7 +165,7 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
         more, bits = output.traffic(is_worst=True)
         worst += bits / can.bitrate
         worst_frames += more
-    core, why_python = make_core(loaded.escs, layout, 0, config.dbc.silent_on_loss)
+    core, why_python = make_core(loaded.core_settings, 0)
     node_ids: list[int | None] = []
     setup = canopen_setup(loaded)
     if setup is not None:

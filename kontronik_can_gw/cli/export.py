@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+from kontronik_can_gw.assembly.assemble import core_settings
 from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.desk import bus_layout
@@ -18,6 +19,7 @@ from kontronik_can_gw.cli.output import (
     writing,
 )
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.native.export_c import EXAMPLE, exported
 from kontronik_can_gw.native.rows import NotInCore
@@ -51,11 +53,12 @@ def main(args: argparse.Namespace) -> int:
     """Write the folder. Raises UserError for faulty input files, RunError if writing fails."""
     folder = Path(output_of(args, "DIR"))
     bus = bus_layout(args)
-    silent_on_loss = bus.config is not None and bus.config.dbc.silent_on_loss
-    quiet_after_ns = 0 if bus.config is None else bus.config.can.quiet_after_ns
+    settings = CoreSettings(bus.escs, bus.layout)
+    if bus.config is not None:
+        settings = core_settings(bus.escs, bus.layout, bus.config)
     licence = shipped("LICENSE").read_text(encoding="utf-8")
     try:
-        files = exported(bus.layout, bus.escs, silent_on_loss, licence, quiet_after_ns)
+        files = exported(settings, licence)
     except NotInCore as error:
         raise UserError(f"{bus.layout.file}: cannot be exported: {error}") from None
     if bus.config is not None and bus.config.canopen.enabled:

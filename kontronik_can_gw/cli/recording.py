@@ -55,7 +55,6 @@ def recorded(
     loaded: Loaded,
     given: Path | None,
     now: int,
-    silent_on_loss: bool,
 ) -> tuple[Gateway, Recorder]:
     """Return the gateway of a configuration and its recorder.
 
@@ -69,15 +68,7 @@ def recorded(
         recorder = EventRecorder(folder, record, len(loaded.escs))
     parts = (in_words(loaded.config, folder), events_in_words(loaded.config))
     recorder.words = ", ".join(filter(None, parts))
-    gateway = RecordedGateway(
-        recorder.put,
-        loaded.escs,
-        loaded.layout,
-        now,
-        silent_on_loss,
-        loaded.outputs,
-        loaded.config.can.quiet_after_ns,
-    )
+    gateway = RecordedGateway(recorder.put, loaded.core_settings, now, loaded.outputs)
     if isinstance(recorder, EventRecorder):
         EventWatch(gateway, record, recorder.trigger)
     known = {

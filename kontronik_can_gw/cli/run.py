@@ -204,21 +204,13 @@ class _Run:
         """
         config = loaded.config
         now = time.monotonic_ns()
-        silent_on_loss = config.dbc.silent_on_loss
         if self._args.record is not None or config.record.directory is not None:
             from kontronik_can_gw.cli.recording import recorded
 
-            return recorded(loaded, self._args.record, now, silent_on_loss)
+            return recorded(loaded, self._args.record, now)
         from kontronik_can_gw.gateway.gateway import Gateway
 
-        gateway = Gateway(
-            loaded.escs,
-            loaded.layout,
-            now,
-            silent_on_loss,
-            loaded.outputs,
-            config.can.quiet_after_ns,
-        )
+        gateway = Gateway(loaded.core_settings, now, loaded.outputs)
         return gateway, None
 
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from kontronik_can_gw.core.interface import Place
 from kontronik_can_gw.core.output import Owner
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
@@ -35,7 +36,7 @@ _EVENT_OF_PACE = {
 class Traits:
     """How a message is sent, according to its plan. The core in C is given the same."""
 
-    def __init__(self, plan: MessagePlan, silent_on_loss: bool) -> None:
+    def __init__(self, plan: MessagePlan, settings: CoreSettings) -> None:
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         self.is_paged = len(plan.pages) > 1
@@ -43,7 +44,7 @@ class Traits:
         self.is_untimed = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
         # Messages with the state of the link are always sent.
         self.is_silent_on_loss = (
-            silent_on_loss
+            settings.silent_on_loss
             and bool(plan.paces & {Group.LIVE, Group.INFO})
             and Group.LINK not in plan.paces
         )
@@ -89,10 +90,10 @@ class _Message(Traits):
         self,
         index: int,
         plan: MessagePlan,
-        silent_on_loss: bool,
+        settings: CoreSettings,
         first_cycle: int,
     ) -> None:
-        super().__init__(plan, silent_on_loss)
+        super().__init__(plan, settings)
         self.index = index
         self.plan = plan
         self.frame = compile_frame(plan)
@@ -224,18 +225,18 @@ def own_ids(layout: Layout) -> dict[int, Owner]:
 class Messages:
     """All messages of one layout.
 
-    With ``silent_on_loss``, messages with values of ESCs stop when the telemetry of all these ESCs
-    is lost. Otherwise they are sent with NotAvailable.
+    While the telemetry of all ESCs of a message is lost, the message is sent with NotAvailable, or
+    stops (``Traits.is_silent_on_loss``).
     """
 
     def __init__(
         self,
-        layout: Layout,
+        settings: CoreSettings,
         escs: Sequence[EscTelemetry],
         gateway: GatewayStatus,
         now: int,
-        silent_on_loss: bool = False,
     ) -> None:
+        layout = settings.layout
         self._escs = escs
         self._gateway = gateway
         first = phases([plan.cycle_ns for plan in layout.messages])
@@ -244,7 +245,7 @@ class Messages:
         self._of_esc: list[list[_Message]] = [[] for _ in escs]
         self._timed: list[_Message] = []
         for index, plan in enumerate(layout.messages):
-            message = _Message(index, plan, silent_on_loss, now + first[index])
+            message = _Message(index, plan, settings, now + first[index])
             self._messages.append(message)
             if message.follows_gateway:
                 self._of_gateway.append(message)

@@ -5,46 +5,39 @@ from collections.abc import Sequence
 from kontronik_can_gw.core.esc_stream import EscStream
 from kontronik_can_gw.core.interface import Follower, Place
 from kontronik_can_gw.core.messages import Messages, own_ids
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.core.slots import Slots
 from kontronik_can_gw.esc.decoder import Reading
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import GatewayState, GatewayStatus
 from kontronik_can_gw.times import NEVER, SECOND
 
 
 class PythonCore:
-    """The core in plain Python. See ``core.interface.Core`` for its methods.
-
-    With ``silent_on_loss``, messages stop while telemetry is lost (``core.messages.Messages``).
-    ``quiet_after_ns`` is the time without telemetry after which quiet mode begins, or 0.
-    """
+    """The core in plain Python. See ``core.interface.Core`` for its methods."""
 
     language = "Python"
     note = ""
 
     def __init__(
         self,
-        escs: Sequence[EscSettings],
-        layout: Layout,
+        settings: CoreSettings,
         now: int,
-        silent_on_loss: bool,
-        quiet_after_ns: int = 0,
     ) -> None:
-        self.escs: list[EscStream] = [EscStream(settings, now) for settings in escs]
-        self.status = GatewayStatus(esc_count=len(escs), started_ns=now, heard_ns=now)
-        self.messages = Messages(layout, self.escs, self.status, now, silent_on_loss)
+        self.escs: list[EscStream] = [EscStream(esc, now) for esc in settings.escs]
+        self.status = GatewayStatus(esc_count=len(settings.escs), started_ns=now, heard_ns=now)
+        self.messages = Messages(settings, self.escs, self.status, now)
         self.slots = Slots(self.escs, self.status)
         self.slot = self.slots.add
-        self.own_ids = own_ids(layout)
+        self.own_ids = own_ids(settings.layout)
         self.gateway_changed = self.messages.on_gateway_change
         self.repeat = self.messages.repeat
         self.stop = self.messages.stop
         self.shortest_timeout_ns = self._shortest_timeout()
         self.followers: Sequence[Follower] = ()
         self.link_changes: list[int] = []
-        self._quiet_after_ns = quiet_after_ns
+        self._quiet_after_ns = settings.quiet_after_ns
         self._second_ns = now
         self._next_expiry = 0
         """No ESC has a deadline before this time. 0: not known.

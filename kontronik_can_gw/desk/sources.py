@@ -15,6 +15,7 @@ from kontronik_can_gw.assembly.assemble import assemble, check_devices
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.config.parse import parse
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.recordings.inputs import Input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.simulator import (
@@ -289,7 +290,7 @@ class DemoBus(Source):
         super().__init__("demo", BusLayout(made.database, made.layout, made.escs, made.config))
         now = time.monotonic_ns()
         self._esc = _flight(seed, now)
-        self._gateway = Gateway(made.escs, made.layout, now)
+        self._gateway = Gateway(CoreSettings(made.escs, made.layout), now)
         self._gateway.port(0, True, now)
         self._gateway.start(now)
 

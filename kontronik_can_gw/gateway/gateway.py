@@ -5,16 +5,17 @@ Bytes, received CAN frames and time go in. CAN frames to send and the next deadl
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from kontronik_can_gw.core.interface import Core, Follower, OnEvent
 from kontronik_can_gw.core.output import NodeOutput, NodeState
 from kontronik_can_gw.core.output_setup import OutputMaker
-from kontronik_can_gw.esc.telemetry import EscSettings, Event
+from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.frame_source import FrameSource
 from kontronik_can_gw.gateway.id_conflicts import IdConflicts
 from kontronik_can_gw.native.load import make_core
-from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import NEVER
 
@@ -23,8 +24,6 @@ class Gateway(FrameSource):
     """One gateway between several ESCs and one CAN bus.
 
     It sends the messages of the layout and the frames of ``outputs``. Each of the two may be empty.
-    Without telemetry for ``quiet_after_ns``, quiet mode begins: the gateway only answers requests.
-    0 means never.
     """
 
     is_recorded = False
@@ -32,15 +31,13 @@ class Gateway(FrameSource):
 
     def __init__(
         self,
-        escs: Sequence[EscSettings],
-        layout: Layout,
+        settings: CoreSettings,
         now: int,
-        silent_on_loss: bool = False,
         outputs: Sequence[OutputMaker] = (),
-        quiet_after_ns: int = 0,
     ) -> None:
+        layout = settings.layout
         slots = sum([maker.slots for maker in outputs])
-        made = make_core(escs, layout, now, silent_on_loss, slots, quiet_after_ns)
+        made = make_core(replace(settings, slots=slots), now)
         core: Core = made.core
         super().__init__(core, tuple([maker.make(core, now) for maker in outputs]), layout)
         self.why_python = made.why

@@ -8,6 +8,7 @@ from typing import Any, cast
 from kontronik_can_gw.core.interface import Follower
 from kontronik_can_gw.core.messages import own_ids
 from kontronik_can_gw.core.output import Owner
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.core.slots import PendingSlot, Slot, Slots, SlotSettings
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
@@ -26,7 +27,6 @@ from kontronik_can_gw.native.slots import (
 from kontronik_can_gw.native.state import NativeEsc, NativeStatus, adopt_places, places_of
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.native.turns import Turns
-from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import END_OF_TIME, NEVER
 
@@ -69,9 +69,8 @@ def _check(esc: int, now: int, escs: int = 1) -> None:
 class NativeCore:
     """The core in C (twin: PythonCore).
 
-    Raises NotInCore if it cannot express the layout or an ESC's settings. ``slots`` is the number
-    of slots of each ESC that C runs. Python runs further slots, and slots with values that C does
-    not have.
+    Raises NotInCore if it cannot express the layout or an ESC's settings. Python runs the slots for
+    which C has no room, and slots with values that C does not have.
     """
 
     language = "C"
@@ -79,24 +78,21 @@ class NativeCore:
     def __init__(
         self,
         library: Any,
-        escs: Sequence[EscSettings],
-        layout: Layout,
+        settings: CoreSettings,
         now: int,
-        silent_on_loss: bool,
-        slots: int = 0,
-        quiet_after_ns: int = 0,
     ) -> None:
-        tables = Tables(layout, escs, silent_on_loss, quiet_after_ns)
-        self._places = reserve(tables, slots)
+        escs = settings.escs
+        tables = Tables(settings)
+        self._places = reserve(tables, settings.slots)
         self.slots_of_esc = len(self._places[0])
         self.library = library
         self._make(tables, now)
         self.status = cast(GatewayStatus, NativeStatus.from_buffer(self.state.gateway))
         self.status.esc_count = len(escs)
         self.escs: list[NativeEsc] = []
-        for settings, state in zip(escs, self.esc_states, strict=True):
-            self.escs.append(NativeEsc(settings, state))
-        self.own_ids: dict[int, Owner] = own_ids(layout)
+        for esc, state in zip(escs, self.esc_states, strict=True):
+            self.escs.append(NativeEsc(esc, state))
+        self.own_ids: dict[int, Owner] = own_ids(settings.layout)
         count = self.plan.messages
         self.places = partial(places_of, self.sending, count)
         self.adopt_places = partial(

@@ -12,6 +12,7 @@ from string import Template
 from typing import Any
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.objects import FOLDER, wire_header
@@ -29,17 +30,16 @@ _WIDTH = 118
 
 
 def exported(
-    layout: Layout,
-    escs: Sequence[EscSettings],
-    silent_on_loss: bool,
+    settings: CoreSettings,
     licence: str,
-    quiet_after_ns: int = 0,
 ) -> dict[str, str]:
     """Return the text of each file by its name.
 
     Raises NotInCore if the core in C cannot express the layout or an ESC's settings.
     """
-    tables = Tables(layout, escs, silent_on_loss, quiet_after_ns)
+    layout = settings.layout
+    escs = settings.escs
+    tables = Tables(settings)
     core_c = (FOLDER / "core.c").read_text(encoding="utf-8")
     core_h = (FOLDER / "core.h").read_text(encoding="utf-8")
     for name, value in _options(layout, tables).items():

@@ -1,15 +1,13 @@
 """Selects the core: in C if its shared object fits and can express the layout, else in Python."""
 
 import os
-from collections.abc import Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.core.interface import Core
 from kontronik_can_gw.core.python_core import PythonCore
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.native.objects import fault, shared_object
-from kontronik_can_gw.signals.plan import Layout
 
 PURE = "KONTRONIK_PURE"
 """Environment variable: 1 asks for the core in Python."""
@@ -42,29 +40,21 @@ def library() -> tuple[Any, str]:
 
 
 def make_core(
-    escs: Sequence[EscSettings],
-    layout: Layout,
+    settings: CoreSettings,
     now: int,
-    silent_on_loss: bool,
-    slots: int = 0,
-    quiet_after_ns: int = 0,
 ) -> Made:
-    """Return the core for these ESCs and this layout.
-
-    ``slots`` is the number of slots of each ESC for which the core in C has room.
-    ``quiet_after_ns`` is the time without telemetry after which quiet mode begins, or 0.
-    """
+    """Return the core in C if it can run with these settings, else the core in Python."""
     found, why = library()
     if found is not None:
         from kontronik_can_gw.native.core import NativeCore
         from kontronik_can_gw.native.rows import NotInCore
 
         try:
-            core = NativeCore(found, escs, layout, now, silent_on_loss, slots, quiet_after_ns)
+            core = NativeCore(found, settings, now)
             return Made(core, "")
         except NotInCore as error:
             why = str(error)
-    return Made(PythonCore(escs, layout, now, silent_on_loss, quiet_after_ns), why)
+    return Made(PythonCore(settings, now), why)
 
 
 def give_back() -> None:

@@ -9,6 +9,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 from kontronik_can_gw.core.output import Output
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.header import KCG, structure
@@ -155,11 +156,7 @@ class Player(Output):
     def set_bytes(self, period_ns: int) -> None:
         """Prepare for plain bytes: they get a time for each live frame, every ``period_ns``."""
         self._finder = NativeCore(
-            self._library,
-            [self._settings],
-            Layout("", "", ()),
-            now=0,
-            silent_on_loss=False,
+            self._library, CoreSettings([self._settings], Layout("", "", ())), 0
         )
         self._finder.state.mask = 0  # no events
         self._state.finder = self._finder.core

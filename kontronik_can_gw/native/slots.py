@@ -3,6 +3,7 @@
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.core.slots import PythonSlot, SlotPlan, SlotSettings
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED
@@ -92,7 +93,7 @@ def slot_rows(plan: SlotPlan, protocol: str) -> Tables:
         raise NotInCore(plan.only_python)
     layout = Layout("", "", (plan.message,))
     settings = EscSettings(protocol=protocol)
-    tables = Tables(layout, (settings,))
+    tables = Tables(CoreSettings((settings,), layout))
     if tables.of_settings:
         raise NotInCore("its rows would contain the settings of an ESC")
     rows = max(len(tables.signals), len(tables.pieces))

@@ -6,15 +6,14 @@ raises NotInCore, too. Then the core in Python runs the whole gateway (load.py, 
 """
 
 import struct
-from collections.abc import Sequence
 from ctypes import c_uint16, c_uint64
 from itertools import accumulate, chain
 from typing import Any
 
 from kontronik_can_gw.core.messages import Traits, phases
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.native.header import KCG
@@ -35,7 +34,7 @@ from kontronik_can_gw.native.rows import (
 )
 from kontronik_can_gw.native.scale import set_scale
 from kontronik_can_gw.signals.packer import alive_modulus, place
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
+from kontronik_can_gw.signals.plan import MessagePlan, Role, SignalPlan
 from kontronik_can_gw.status import GatewayState
 from kontronik_can_gw.times import END_OF_TIME
 
@@ -58,12 +57,11 @@ class Tables:
 
     def __init__(
         self,
-        layout: Layout,
-        escs: Sequence[EscSettings],
-        silent_on_loss: bool = False,
-        quiet_after_ns: int = 0,
+        settings: CoreSettings,
     ) -> None:
-        self._quiet_after_ns = quiet_after_ns
+        layout = settings.layout
+        escs = settings.escs
+        self._core_settings = settings
         self._plans = layout.messages
         self.signals = Rows(Signal)
         self.messages = Rows(Message)
@@ -92,7 +90,7 @@ class Tables:
             longest = max(plan.cycle_ns, plan.delay_ns)
             if longest >= END_OF_TIME:
                 raise NotInCore(f"{plan.name}: a cycle time or delay of {longest} ns is too long")
-            self._add(plan, silent_on_loss, starts[index])
+            self._add(plan, starts[index])
             for esc in plan.escs:
                 if self.messages[-1].triggers:
                     self.listeners_of[esc].append(index)
@@ -147,12 +145,12 @@ class Tables:
             "escs": len(self.settings),
             "pages": self.pages,
             "slots": slots,
-            "quiet_after": self._quiet_after_ns,
+            "quiet_after": self._core_settings.quiet_after_ns,
         }
 
-    def _add(self, plan: MessagePlan, silent_on_loss: bool, phase: int) -> None:
+    def _add(self, plan: MessagePlan, phase: int) -> None:
         crc = next((s for s in plan.compiled if s.role is Role.CRC), None)
-        traits = Traits(plan, silent_on_loss)
+        traits = Traits(plan, self._core_settings)
         flags = KCG.EVENT * traits.by_event
         flags |= KCG.ON_CHANGE * traits.on_change
         flags |= KCG.HAS_CRC * (crc is not None)

@@ -201,6 +201,7 @@ def plain_bytes(context: Context) -> list[Figure]:
 
 def scan(source: Path) -> float:
     """Return the CPU seconds that the core in C needs to find all frames."""
+    from kontronik_can_gw.core.settings import CoreSettings
     from kontronik_can_gw.esc.telemetry import EscSettings
     from kontronik_can_gw.native.binding import load
     from kontronik_can_gw.native.core import NativeCore
@@ -210,7 +211,7 @@ def scan(source: Path) -> float:
     data = source.read_bytes()
     escs = [EscSettings("esc1")]
     empty = Layout("", "", ())
-    core = NativeCore(load(shared_object()), escs, empty, 0, False)
+    core = NativeCore(load(shared_object()), CoreSettings(escs, empty), 0)
     core.state.mask = 0  # no events
     begun = time.process_time()
     for at in range(0, len(data), 16384):

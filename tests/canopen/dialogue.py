@@ -24,6 +24,7 @@ from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, decode
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.states import Device
@@ -135,7 +136,9 @@ class Bench(Talker):
             tuple(stored or [Stored()] * len(node_ids)),
             base,
         )
-        self.gateway = Gateway(self.setup.esc_settings(base), layout, 0, outputs=[self.setup])
+        self.gateway = Gateway(
+            CoreSettings(self.setup.esc_settings(base), layout), 0, outputs=[self.setup]
+        )
         self.on_disk = list(self.setup.stored)
         self.now = 0
         self.heard: list[tuple[int, CanFrame]] = []

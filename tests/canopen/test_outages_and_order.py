@@ -5,6 +5,7 @@ from dialogue import EMPTY, QUIET, Bench, live, tpdo
 from kontronik_can_gw.canopen.nodes import traffic
 from kontronik_can_gw.canopen.objects import GATEWAY, LINK
 from kontronik_can_gw.canopen.storage import Stored
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
@@ -46,7 +47,9 @@ def test_a_stored_value_that_does_not_fit_is_reported_once_at_each_reset() -> No
 def test_the_node_ids_to_lock_are_known_before_the_start() -> None:
     """Locks between gateways are taken before the first frame is sent."""
     setup = Bench(node_ids=[5, 9, UNCONFIGURED]).setup
-    gateway = Gateway([EscSettings(f"esc{n}") for n in range(3)], EMPTY, 0, outputs=[setup])
+    gateway = Gateway(
+        CoreSettings([EscSettings(f"esc{n}") for n in range(3)], EMPTY), 0, outputs=[setup]
+    )
     assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]
     gateway.start(0)
     assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]

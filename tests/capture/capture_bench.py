@@ -15,6 +15,7 @@ from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
 from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.parse import parse
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.frames import CanFrame
@@ -69,12 +70,14 @@ class Bench:
     def __post_init__(self) -> None:
         self.gateway = RecordedGateway(
             self._put,
-            self.setup.escs,
-            self.layout,
+            CoreSettings(
+                self.setup.escs,
+                self.layout,
+                silent_on_loss=self.setup.dbc_settings.silent_on_loss,
+                quiet_after_ns=self.setup.quiet_after_ns,
+            ),
             START,
-            self.setup.dbc_settings.silent_on_loss,
-            self.setup.outputs,
-            self.setup.quiet_after_ns,
+            outputs=self.setup.outputs,
         )
         self.quiet_turns = 0
         """Number of turns in quiet mode."""

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from kontronik_can_gw.config.keys import RecordConfig
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
@@ -31,7 +32,7 @@ class Watched:
 
     def __post_init__(self) -> None:
         escs = [EscSettings("left"), EscSettings("right")]
-        self.gateway = Gateway(escs, Layout("", "", ()), START)
+        self.gateway = Gateway(CoreSettings(escs, Layout("", "", ())), START)
         EventWatch(self.gateway, self.config, self._event, lambda: 1.0)
         self.gateway.start(START)
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.simulator import (
     FLIGHT,
@@ -52,7 +53,7 @@ def flight(
     others = len(bus.escs) - len(options)
     given = [*options, *[EscOptions(profile=FLYING)] * others]
     simulated = [SimulatedEsc(each, seed=index) for index, each in enumerate(given)]
-    gateway = Gateway(bus.escs, bus.layout, 0)
+    gateway = Gateway(CoreSettings(bus.escs, bus.layout), 0)
     for index in range(len(simulated)):
         gateway.port(index, True, 0)
     gateway.start(0)

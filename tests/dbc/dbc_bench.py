@@ -8,6 +8,7 @@ import pytest
 from cantools.database.can import Database
 
 from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
@@ -65,7 +66,7 @@ def gateway_with(layout: Layout, *lives: LiveData) -> Gateway:
     """
     count = max(1, len(lives))
     escs = [EscSettings(f"esc{number}", 7) for number in range(1, count + 1)]
-    gateway = Gateway(escs, layout, 0)
+    gateway = Gateway(CoreSettings(escs, layout), 0)
     for esc, live in enumerate(lives):
         wire = encode(live, WireLayout.V4)
         gateway.receive_bytes(esc, wire, NOW, NOW)

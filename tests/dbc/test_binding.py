@@ -14,6 +14,7 @@ from dbc_bench import compiled, gateway_with, packed, refused
 from e2e import p01
 from packer_oracle import Msg, Sig, dbc_text, get
 
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.names import Binder
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -223,7 +224,7 @@ def test_frames_with_a_crc_pass_the_check_of_the_autosar_package(
     ]
     layout = layout_of([Msg("M", 0x12345, 8, signals, extended=True)], e2e_data_ids=data_ids)
     data_id = data_ids.get("M", 0x2345)
-    gateway = Gateway([EscSettings("esc1", 7)], layout, 0)
+    gateway = Gateway(CoreSettings([EscSettings("esc1", 7)], layout), 0)
     gateway.start(0)
     frames = gateway.take_frames(0)
     for n in range(40):

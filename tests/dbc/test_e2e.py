@@ -21,6 +21,7 @@ from packer_oracle import Msg, Sig, dbc_text, get, read
 
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc import e2e_attributes
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.prepare import prepare
@@ -130,7 +131,7 @@ class Sender:
     """A gateway with one ESC, and all frames that it has sent."""
 
     def __init__(self, layout: Layout, start: int = 0) -> None:
-        self.gateway = Gateway([EscSettings("esc1", 7)], layout, start)
+        self.gateway = Gateway(CoreSettings([EscSettings("esc1", 7)], layout), start)
         self.gateway.start(start)
         self.now = start
         self.sent: list[CanFrame] = self.gateway.take_frames(start)

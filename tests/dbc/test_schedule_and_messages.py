@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from packer_oracle import Msg, Sig, dbc_text, get
 
 from kontronik_can_gw.core.messages import phases
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -50,7 +51,7 @@ class Bench:
         text = dbc_text([message for message, *_ in messages], "\n".join(attributes))
         layout = compiled(text, names)
         escs = [EscSettings(name, 7) for name in names]
-        self.gateway = Gateway(escs, layout, 0, silent_on_loss)
+        self.gateway = Gateway(CoreSettings(escs, layout, silent_on_loss=silent_on_loss), 0)
         self.now = 0
         self.sent: list[tuple[int, CanFrame]] = []
         if start:

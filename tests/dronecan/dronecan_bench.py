@@ -124,9 +124,7 @@ class Bench:
     ) -> None:
         self.loaded = given or loaded(escs, **table)
         self.now = START
-        self.gateway = Gateway(
-            self.loaded.escs, self.loaded.layout, START, False, self.loaded.outputs
-        )
+        self.gateway = Gateway(self.loaded.core_settings, START, outputs=self.loaded.outputs)
         self.live: list[LiveData | None] = [LIVE] * escs
         self.frames: list[tuple[int, CanFrame]] = []
         self.read: list[Transfer] = []

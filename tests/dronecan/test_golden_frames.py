@@ -13,6 +13,7 @@ from dronecan_bench import Reader, dronecan, peers_frames
 from packer_oracle import random_live
 
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.core.slots import SlotSettings
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.esc_report import fill, plans_of
@@ -49,15 +50,9 @@ class Measuring:
     ) -> None:
         escs = [EscSettings()]
         layout = Layout("", "", ())
-        self.core: Any = PythonCore(escs, layout, 0, False)
+        self.core: Any = PythonCore(CoreSettings(escs, layout), 0)
         if not is_pure:
-            self.core, why = make_core(
-                escs,
-                layout,
-                0,
-                False,
-                slots=1,
-            )
+            self.core, why = make_core(CoreSettings(escs, layout, slots=1), 0)
             if why:
                 pytest.skip(why)
         self.kind = kind

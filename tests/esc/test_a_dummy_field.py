@@ -30,7 +30,7 @@ from kontronik_can_gw.runtime.status.snapshot import (_esc)
 
 esc = [{"port": "/dev/null"}, {"port": "/dev/zero"}]
 config = parse({"can": {"interface": "virtual", "channel": "x"}, "esc": esc}, "x.toml")
-gateway = Gateway(config.escs, assemble(config).layout, 0, outputs=[shipped_canopen([1, 2])])
+gateway = Gateway(assemble(config).core_settings, 0, outputs=[shipped_canopen([1, 2])])
 gateway.start(0)
 escs = []
 for device in (Device.KOSMIK, Device.JIVEPRO):

@@ -63,7 +63,7 @@ class Flight:
     def __init__(self, **options: Any) -> None:
         config = parse(MIXED, "mixed.toml")
         self.loaded = assemble(config)
-        self.gateway = Gateway(config.escs, self.loaded.layout, 0, **options)
+        self.gateway = Gateway(self.loaded.core_settings, 0, **options)
         self.gateway.start(0)
         self.now = 0
         self.seen: dict[str, float] = {}

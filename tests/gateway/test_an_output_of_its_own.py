@@ -11,6 +11,7 @@ from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.core.output import NO_IDS, NodeOutput, NodeState, Output, OutputHost, Owner
 from kontronik_can_gw.core.output_setup import ReadyOutput
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
@@ -120,7 +121,7 @@ class Memory(NodeOutput):
 def test_node_output_stores_parameters_and_plain_output_is_not_asked() -> None:
     memory, plain = Memory(), Output()
     makers = [ReadyOutput(plain), ReadyOutput(memory)]
-    gateway = Gateway(ESCS, Layout("", "", ()), 0, outputs=makers)
+    gateway = Gateway(CoreSettings(ESCS, Layout("", "", ())), 0, outputs=makers)
     assert gateway.node_outputs == [memory]
     for number in (2, 3, 4):
         before = gateway.revision
@@ -138,7 +139,7 @@ def test_node_output_stores_parameters_and_plain_output_is_not_asked() -> None:
 
 
 def test_a_further_output_sends_values_and_receives_commands() -> None:
-    gateway = Gateway(ESCS, Layout("", "", ()), 0, outputs=[VoltagesMaker()])
+    gateway = Gateway(CoreSettings(ESCS, Layout("", "", ())), 0, outputs=[VoltagesMaker()])
     gateway.start(0)
     found = []
     for now in range(0, 4 * SECOND, SECOND // 10):
@@ -164,7 +165,7 @@ def test_a_further_output_sends_values_and_receives_commands() -> None:
 
 
 def test_another_device_with_ids_of_a_further_output_is_noticed() -> None:
-    gateway = Gateway(ESCS, Layout("", "", ()), 0, outputs=[VoltagesMaker()])
+    gateway = Gateway(CoreSettings(ESCS, Layout("", "", ())), 0, outputs=[VoltagesMaker()])
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
     (conflict,) = gateway.conflicts.take()

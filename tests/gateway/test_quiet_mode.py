@@ -45,11 +45,9 @@ class Bench:
     def __init__(self, given: Loaded) -> None:
         self.now = SECOND
         self.gateway = Gateway(
-            given.escs,
-            given.layout,
+            given.core_settings,
             self.now,
             outputs=given.outputs,
-            quiet_after_ns=given.config.can.quiet_after_ns,
         )
         self.sent: list[tuple[int, CanFrame]] = []
         self.wakes = 0

@@ -4,6 +4,7 @@ import pytest
 from dbc_bench import compiled
 from packer_oracle import Msg, Sig, dbc_text
 
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, device_and_variant
@@ -32,7 +33,7 @@ class Bench:
     """A gateway with one message that runs at each of its deadlines."""
 
     def __init__(self, signal: Sig, more: str = EVENT) -> None:
-        self.gateway = Gateway((ESC,), compiled(text_of(signal, more)), 0)
+        self.gateway = Gateway(CoreSettings((ESC,), compiled(text_of(signal, more))), 0)
         self.now = 0
         self.gateway.start(0)
         self.first = self.take()

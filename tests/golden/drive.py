@@ -77,8 +77,11 @@ class Drive:
         folder = f"{file.parent}/"
         warnings = [*loaded.layout.warnings, *loaded.warnings]
         self.warnings = [line.replace(folder, "") for line in warnings]
-        silent_on_loss = loaded.config.dbc.silent_on_loss
-        self._gateway = Gateway(loaded.escs, loaded.layout, 0, silent_on_loss, loaded.outputs)
+        self._gateway = Gateway(
+            loaded.core_settings,
+            0,
+            outputs=loaded.outputs,
+        )
         self._waiting = TransmitQueue()
         self._open = True
         self._now = 0

@@ -7,6 +7,7 @@ equal.
 import math
 import random
 from collections.abc import Sequence
+from dataclasses import replace
 from fractions import Fraction
 from functools import cache
 from itertools import zip_longest
@@ -33,6 +34,7 @@ from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core.interface import Follower
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.core.slots import Slot, SlotPlan, SlotSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.errors import UserError
@@ -372,10 +374,10 @@ class Both:
         self.silent_steps = 0
         """Number of further steps without bytes of an ESC."""
         self.events: tuple[list[Any], list[Any]] = ([], [])
-        given = self.escs, self.layout, self.now, self.silent_on_loss
-        self.python = PythonCore(*given, self.quiet_after_ns)
+        settings = CoreSettings(escs, layout, self.silent_on_loss, self.quiet_after_ns)
+        self.python = PythonCore(settings, self.now)
         slots = chance.choice((0, 1, 3))
-        self.native = NativeCore(library, *given, slots, self.quiet_after_ns)
+        self.native = NativeCore(library, replace(settings, slots=slots), self.now)
         self.slots = []
         for esc in range(len(self.escs)):
             for _ in range(slots):

@@ -11,6 +11,7 @@ from built import STRICT
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.export_c import exported
 from kontronik_can_gw.native.rows import NotInCore
@@ -43,7 +44,13 @@ class Case:
             try:
                 licence = shipped("LICENSE").read_text(encoding="utf-8")
                 files = exported(
-                    self.layout, self.escs, self.silent_on_loss, licence, self.quiet_after_ns
+                    CoreSettings(
+                        self.escs,
+                        self.layout,
+                        silent_on_loss=self.silent_on_loss,
+                        quiet_after_ns=self.quiet_after_ns,
+                    ),
+                    licence,
                 )
                 break
             except NotInCore:
@@ -96,7 +103,15 @@ class Case:
 
     def expected(self) -> str:
         """Return the frames of the Python core with the same clock, in the format of candump."""
-        core = PythonCore(self.escs, self.layout, 0, self.silent_on_loss, self.quiet_after_ns)
+        core = PythonCore(
+            CoreSettings(
+                self.escs,
+                self.layout,
+                silent_on_loss=self.silent_on_loss,
+                quiet_after_ns=self.quiet_after_ns,
+            ),
+            0,
+        )
         core.status.state = GatewayState.RUNNING
         core.status.can_state = CanState.ERROR_ACTIVE
         core.repeat(0)

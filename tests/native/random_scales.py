@@ -9,6 +9,7 @@ from packer_oracle import random_info, random_live
 
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
@@ -91,11 +92,11 @@ def run(library: Any, seed: int, digits: int, frames: int = 40) -> str:
     escs, layout = scaled(seed, digits)
     chance = random.Random(seed)
     try:
-        native = NativeCore(library, escs, layout, 0, False)
-        exported(layout, escs, False, "licence")
+        native = NativeCore(library, CoreSettings(escs, layout), 0)
+        exported(CoreSettings(escs, layout), "licence")
     except NotInCore as error:
         return str(error)
-    python = PythonCore(escs, layout, 0, False)
+    python = PythonCore(CoreSettings(escs, layout), 0)
     for number in range(frames):
         now = (number + 1) * 10 * MS
         reading = random_info(chance) if number % 8 == 1 else random_live(chance)

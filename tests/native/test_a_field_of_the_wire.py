@@ -27,6 +27,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
@@ -73,15 +74,16 @@ def frames(core):
     return found
 
 
-made = make_core(escs, layout, 0, False)
+settings = CoreSettings(escs, layout)
+made = make_core(settings, 0)
 folder = Path("firmware")
 folder.mkdir()
-for name, text in exported(layout, escs, False, "licence").items():
+for name, text in exported(settings, "licence").items():
     (folder / name).write_text(text)
 (folder / "uart.bin").write_bytes(b"".join(stream(WireLayout.V4)))
 print(json.dumps({
     "why": made.why,
-    "in Python": frames(PythonCore(escs, layout, 0, False)),
+    "in Python": frames(PythonCore(settings, 0)),
     "in C": frames(made.core),
 }))
 """

@@ -21,6 +21,7 @@ from kontronik_can_gw.canopen.eds import load as load_eds
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.core.slots import SlotPlan, SlotSettings
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -102,7 +103,7 @@ def test_a_factor_of_many_digits_gives_the_same_frames_in_c(native_library: Any,
     name, (low, high) = chance.choice([*SOURCES.items()])
     layout = compiled(_scaled(chance), bind={"S": name})
     escs = [EscSettings("esc1", pole_pairs=chance.choice((1, 7, 255)))]
-    (row,) = Tables(layout, escs).signals
+    (row,) = Tables(CoreSettings(escs, layout)).signals
     ends = [(end * row.div - row.add) // row.mul for end in (row.low, row.high + 1)]
     steps = {low, high, 0, *(chance.randint(low, high) for _ in range(20))}
     middles = [row.most, -row.most, *ends]
@@ -112,8 +113,8 @@ def test_a_factor_of_many_digits_gives_the_same_frames_in_c(native_library: Any,
         steps |= {step for step in near if low <= step <= high}
     field = "battery_current" if name == "battery_current" else "electrical_speed"
     cores = (
-        PythonCore(escs, layout, 0, False),
-        NativeCore(native_library, escs, layout, 0, False),
+        PythonCore(CoreSettings(escs, layout), 0),
+        NativeCore(native_library, CoreSettings(escs, layout), 0),
     )
     for number, step in enumerate(sorted(steps)):
         now = number * 10 * MS + MS
@@ -163,10 +164,10 @@ def test_settings_changed_at_run_time_apply_to_speeds_in_rad_per_s(native_librar
     """Rows whose exact numbers leave 64 bits contain the settings, so they are made again."""
     layout = compiled(RAD_PER_S, bind=BINDINGS_OF_RAD_PER_S)
     escs = [EscSettings("esc1", 7, Fraction(5, 2))]
-    assert Tables(layout, escs).of_settings
+    assert Tables(CoreSettings(escs, layout)).of_settings
     cores = (
-        PythonCore(escs, layout, 0, False),
-        NativeCore(native_library, escs, layout, 0, False),
+        PythonCore(CoreSettings(escs, layout), 0),
+        NativeCore(native_library, CoreSettings(escs, layout), 0),
     )
     now = 0
     for poles, gear in ((7, Fraction(5, 2)), (14, Fraction("9.81818")), (255, Fraction(1, 9))):
@@ -201,11 +202,11 @@ def test_a_suggested_factor_fits_and_is_almost_equal(
     escs = [EscSettings("esc1")]
     text = HEAD + TOO_FINE
     with pytest.raises(NotInCore) as found:
-        Tables(compiled(text.format(factor, "s"), bind={"S": source}), escs)
+        Tables(CoreSettings(escs, compiled(text.format(factor, "s"), bind={"S": source})))
     advice = re.search(r"M\.S: factor \S+ exceeds 64 bits\. " + remedy, str(found.value))
     assert advice is not None, str(found.value)
     assert abs(float(advice[1]) / float(factor) - 1) <= 1e-6
-    Tables(compiled(text.format(advice[1], "s"), bind={"S": source}), escs)
+    Tables(CoreSettings(escs, compiled(text.format(advice[1], "s"), bind={"S": source})))
 
 
 def test_no_factor_is_suggested_if_none_is_almost_equal() -> None:
@@ -213,8 +214,10 @@ def test_no_factor_is_suggested_if_none_is_almost_equal() -> None:
     text = HEAD + ' SG_ S : 0|64@1+ (1,0) [0|0] "rad/s" X\n'
     with pytest.raises(NotInCore) as found:
         Tables(
-            compiled(text.replace("(1,", "(1e-9,"), bind={"S": "output_speed"}),
-            [EscSettings("esc1")],
+            CoreSettings(
+                [EscSettings("esc1")],
+                compiled(text.replace("(1,", "(1e-9,"), bind={"S": "output_speed"}),
+            )
         )
     reason = "M.S: factor 1e-09 exceeds 64 bits. A smaller maximum or fewer bits may fit"
     assert str(found.value) == reason
@@ -244,8 +247,8 @@ def test_a_float_with_a_factor_of_many_digits_gives_the_same_frames_in_c(
     length, code = form
     layout = compiled(HEAD + FLOAT.format(length, factor, unit, code), bind={"S": source})
     escs = [EscSettings("esc1", 7)]
-    python = PythonCore(escs, layout, 0, False)
-    native = NativeCore(native_library, escs, layout, 0, False)
+    python = PythonCore(CoreSettings(escs, layout), 0)
+    native = NativeCore(native_library, CoreSettings(escs, layout), 0)
     chance = random.Random(1)
     for number in range(500):
         now = number * 10 * MS
@@ -271,7 +274,7 @@ def test_a_float_that_needs_more_than_64_bits_is_refused(
     length, code = form
     layout = compiled(HEAD + FLOAT.format(length, factor, "rad/s", code), bind={"S": "motor_speed"})
     with pytest.raises(NotInCore, match=r"exceeds 64 bits\. An integer may fit$"):
-        Tables(layout, [EscSettings("esc1", 7)])
+        Tables(CoreSettings([EscSettings("esc1", 7)], layout))
 
 
 def test_a_value_that_the_c_core_does_not_compute_is_refused_by_name() -> None:
@@ -282,7 +285,7 @@ def test_a_value_that_the_c_core_does_not_compute_is_refused_by_name() -> None:
     (signal,) = plan.signals
     other = replace(plan, compiled=(replace(signal, source=bec),))
     with pytest.raises(NotInCore, match=r"^M\.S: BEC power is computed in Python only$"):
-        Tables(Layout("", "", (other,)), [EscSettings("esc1")])
+        Tables(CoreSettings([EscSettings("esc1")], Layout("", "", (other,))))
 
 
 def test_every_value_of_the_product_has_a_source_in_c() -> None:
@@ -313,13 +316,7 @@ def _sort_calls(library: Any, messages: int) -> int:
     by_time = replace(plan, send_type=SendType.CYCLIC, cycle_ns=10 * MS, delay_ns=0)
     plans = [replace(by_event, can_id=n) for n in range(messages)]
     plans += [replace(by_time, can_id=messages + n) for n in range(messages)]
-    core = NativeCore(
-        library,
-        [EscSettings("esc1")],
-        Layout("", "", tuple(plans)),
-        0,
-        False,
-    )
+    core = NativeCore(library, CoreSettings([EscSettings("esc1")], Layout("", "", tuple(plans))), 0)
     core.receive(0, encode(LiveData(electrical_speed=1), WireLayout.V4), 10 * MS, 10 * MS)
     core.advance(10 * MS)
     calls = c.c_ulong.in_dll(library, "kcg_calls")
@@ -350,8 +347,8 @@ def test_a_large_energy_is_equal_in_both_cores_and_restarts_at_0(
     native_library: Any,
     mw_s: int,
 ) -> None:
-    given = (EscSettings(),), Layout("", "", ()), 0, False
-    for core in (PythonCore(*given), NativeCore(native_library, *given, slots=1)):
+    settings = CoreSettings((EscSettings(),), Layout("", "", ()), slots=1)
+    for core in (PythonCore(settings, 0), NativeCore(native_library, settings, 0)):
         slot = core.slot(0)
         slot.configure(SlotSettings(_energy_object(), 0x181, True, 0, 0), 0)
         slot.start(0)
@@ -363,7 +360,7 @@ def test_a_large_energy_is_equal_in_both_cores_and_restarts_at_0(
 
 def test_a_frame_at_the_end_of_a_stream_is_found_but_not_processed(native_library: Any) -> None:
     """Later calls do not process it either. In this stream a shorter frame follows a header."""
-    core = NativeCore(native_library, [EscSettings()], Layout("", "", ()), 0, False)
+    core = NativeCore(native_library, CoreSettings([EscSettings()], Layout("", "", ())), 0)
     frame = encode(LiveData(battery_voltage=2400), WireLayout.LEGACY)
     core.receive(0, b"KODI" + frame, SECOND, SECOND)
     native_library.kcg_end(core.core, 0)

@@ -13,6 +13,7 @@ from firmware import Case
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -109,7 +110,7 @@ def test_names_never_end_a_comment_and_are_unique() -> None:
     bus = layout_of_dbc(shipped("dbc/kontronik_esc.dbc"))
     names = "a*/b", "a  b", "é\n", "COUNT"
     layout = replace(bus.layout, file='/x/*/"\\\n.dbc')
-    files = exported(layout, [EscSettings(name) for name in names], False, "licence")
+    files = exported(CoreSettings([EscSettings(name) for name in names], layout), "licence")
     assert "KCG_ESC_a__b, KCG_ESC_a__b_2, KCG_ESC___, KCG_ESC_COUNT_2," in files["tables.h"]
     assert "Messages of ___.dbc:" in files["tables.h"]
     assert all(text.isascii() for text in files.values())

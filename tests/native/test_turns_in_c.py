@@ -31,6 +31,7 @@ from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.core.output_setup import OutputSetup, ReadyOutput
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dronecan.node_setup import Given
 from kontronik_can_gw.dronecan.setup import DronecanSetup
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
@@ -161,7 +162,7 @@ class Recorded(InC):
 
     def replayed(self, patch: pytest.MonkeyPatch) -> list[tuple[int, bytes]]:
         patch.setattr(load, "library", lambda: (None, ""))
-        gateway = Gateway(self.escs, self.layout, self.begun, outputs=self.outputs)
+        gateway = Gateway(CoreSettings(self.escs, self.layout), self.begun, outputs=self.outputs)
         assert gateway.core.language == "Python"
         replay = Replay(gateway)
         frames = [timed.frame for timed in replay.follow(self.entries)]

@@ -13,6 +13,7 @@ import pytest
 
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core.interface import Follower
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc import protocols
@@ -68,7 +69,8 @@ def layout_of(signal: str, more: str = "", length: int = 8) -> Layout:
 
 def why(layout: Layout = EMPTY, **settings: object) -> str:
     """Return why a gateway with one ESC has the Python core, or ""."""
-    gateway = Gateway([replace(EscSettings(), **settings)], layout, 0)  # type: ignore[arg-type]
+    esc = replace(EscSettings(), **settings)  # type: ignore[arg-type]
+    gateway = Gateway(CoreSettings([esc], layout), 0)
     assert gateway.core.language == ("Python" if gateway.why_python else "C")
     return gateway.why_python
 
@@ -163,7 +165,7 @@ NOT_AVAILABLE = 0xFFFF_FFFF
 
 @needs_c
 def test_settings_beyond_the_limits_make_speeds_not_available() -> None:
-    gateway = Gateway([EscSettings(pole_pairs=7)], layout_of(SPEEDS), 0)
+    gateway = Gateway(CoreSettings([EscSettings(pole_pairs=7)], layout_of(SPEEDS)), 0)
     assert gateway.core.language == "C"
     cases = (
         (7, Fraction(490_909, 50_000), 10_000, 1_019),
@@ -196,7 +198,7 @@ def test_settings_that_the_c_core_cannot_express_run_in_python(
 
 @needs_c
 def test_note_of_the_c_core_tells_that_an_output_follows_live_frames() -> None:
-    core = Gateway([EscSettings()], EMPTY, 0).core
+    core = Gateway(CoreSettings([EscSettings()], EMPTY), 0).core
     assert (core.language, core.note) == ("C", "")
     core.followers = [Follower(Event.LINK | Event.LIVE, lambda *_: None)]
     reason = "a PDO, record.when or another output needs it"

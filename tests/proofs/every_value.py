@@ -19,6 +19,7 @@ from specification.rule import Rule, Shape
 
 from kontronik_can_gw.assembly.assemble import load_configuration
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.native.export_c import exported
 
@@ -224,7 +225,7 @@ def set_bits(bits: Sequence[int], number: int) -> list[int]:
 def export_shipped(folder: Path) -> None:
     """Write the core and the tables of the shipped DBC into a folder."""
     bus = layout_of_dbc(DBC)
-    for name, text in exported(bus.layout, bus.escs, False, "").items():
+    for name, text in exported(CoreSettings(bus.escs, bus.layout), "").items():
         (folder / name).write_text(text, encoding="utf-8")
 
 
@@ -239,8 +240,7 @@ def compare_values(configuration: Path, part: str, is_long: bool = False) -> Com
     assert loaded.database is not None
     config = loaded.config
     quiet_after_ns = config.can.quiet_after_ns
-    arguments = (loaded.layout, loaded.escs, config.dbc.silent_on_loss, "", quiet_after_ns)
-    for name, text in exported(*arguments).items():
+    for name, text in exported(loaded.core_settings, "").items():
         (folder / name).write_text(text, encoding="utf-8")
     header = Header([*expected_messages(loaded.database, loaded.escs, config.dbc)])
     (folder / "expected.h").write_text(header.text(quiet_after_ns, is_long))

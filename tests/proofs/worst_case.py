@@ -14,6 +14,7 @@ from built import there
 from every_value import export_shipped
 from longest_path import Costs, read_functions
 
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.tables import Tables
@@ -74,7 +75,7 @@ class Plan:
 
 def plan_of(dbc: Path) -> Plan:
     bus = layout_of_dbc(dbc)
-    tables = Tables(bus.layout, bus.escs, False)
+    tables = Tables(CoreSettings(bus.escs, bus.layout))
     on_change = [row for row in tables.messages if row.flags & KCG.ON_CHANGE]
     news = [row for row in on_change if not row.flags & KCG.EVENT]
     news_signals = [

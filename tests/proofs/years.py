@@ -21,6 +21,7 @@ from kontronik_can_gw.canopen.eds import load as load_eds
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.python_core import PythonCore
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.core.slots import SlotSettings
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.dronecan import wire
@@ -283,7 +284,7 @@ class RunInC:
         self.oracle = Oracle(library, started)
         layout = layout_of_dbc(DBC).layout
         slots = len(PDOS) + len(TRANSFERS)
-        self.core = NativeCore(library, (SETTINGS,), layout, started, False, slots)
+        self.core = NativeCore(library, CoreSettings((SETTINGS,), layout, slots=slots), started)
         set_running(self.core)
         add_slots(self.core, started, with_python=False)
 
@@ -305,8 +306,8 @@ class RunInBoth:
         self.oracle = Oracle(library, started)
         layout = layout_of_dbc(DBC).layout
         slots = len(PDOS) + len(PDOS_IN_PYTHON) + len(TRANSFERS)
-        self.native = NativeCore(library, (SETTINGS,), layout, started, False, slots)
-        self.python = PythonCore((SETTINGS,), layout, started, False)
+        self.native = NativeCore(library, CoreSettings((SETTINGS,), layout, slots=slots), started)
+        self.python = PythonCore(CoreSettings((SETTINGS,), layout), started)
         self.cores = (self.python, self.native)
         for core in self.cores:
             set_running(core)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, SimulatedEsc
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -39,7 +40,7 @@ class Bench:
         self.now = START
         names = [f"esc{number + 1}" for number in range(self.escs)]
         made = [EscSettings(name, self.settings.pole_pairs, self.settings.gear) for name in names]
-        self.gateway = Gateway(made, Layout("", "", ()), START)
+        self.gateway = Gateway(CoreSettings(made, Layout("", "", ())), START)
         self.gateway.start(START)
         self.simulated = [
             SimulatedEsc(self.options, seed=n, start_ns=START) for n in range(self.escs)

@@ -113,7 +113,7 @@ class Bench:
             "dbc": dbc or {},
         }
         loaded = assemble(parse(tables, "test"))
-        self.gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
+        self.gateway = Gateway(loaded.core_settings, 0, outputs=loaded.outputs)
         self.kernel = kernel
         self.now = 0
         self.clock = 0
@@ -422,7 +422,7 @@ def drone(kernel: Kernel, node_id: int = 42) -> Bench:
     table = {"enabled": True, "node_id": node_id}
     tables = {"dbc": {"enabled": False}, "dronecan": table, "esc": [{"port": "p"}]}
     loaded = assemble(parse(tables, "test"))
-    made.gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
+    made.gateway = Gateway(loaded.core_settings, 0, outputs=loaded.outputs)
     made.kernel = kernel
     made.now = 0
     made.clock = 0

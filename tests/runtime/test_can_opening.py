@@ -18,6 +18,7 @@ from can.interfaces import slcan
 from wire_world import Bus, World, layout_of
 
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -105,7 +106,7 @@ class Running:
     ) -> None:
         self.esc, path = uart
         self.status = Status()
-        gateway = Gateway(ESCS, layout_of(ESCS), 0)
+        gateway = Gateway(CoreSettings(ESCS, layout_of(ESCS)), 0)
         config = CanConfig(interface=interface, channel=channel)
         poller = poller_for(gateway)
         self.loop = Loop(

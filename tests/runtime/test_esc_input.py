@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from wire_world import Wire, World, loop_in, run
 
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik import codec
@@ -69,7 +70,7 @@ class Bench:
 
     def __init__(self, *paths: str) -> None:
         escs = [EscSettings(name) for name in ("left", "right")[: len(paths)]]
-        self.gateway = Gateway(escs, Layout("x", "Gw", ()), 0)
+        self.gateway = Gateway(CoreSettings(escs, Layout("x", "Gw", ())), 0)
         self.conditions = FaultLog()
         self.poller = World().poller
         self.lost: set[EscPort] = set()
@@ -373,7 +374,7 @@ def test_settings_changed_by_another_program_are_restored(core_language: str) ->
         def hold() -> bool:
             if core_language == "Python":
                 return port.settings_hold()
-            gateway = Gateway([EscSettings()], Layout("", "", ()), 0)
+            gateway = Gateway(CoreSettings([EscSettings()], Layout("", "", ())), 0)
             turns = gateway.core.turns()  # type: ignore[attr-defined]
             turns.inputs[0].settings[:] = port.settings
             assert turns.watch([(port.fileno(), select.POLLIN, 0)])

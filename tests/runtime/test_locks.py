@@ -107,7 +107,7 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -
     sides = []
     try:
         for _ in range(2):
-            gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
+            gateway = Gateway(loaded.core_settings, 0, outputs=loaded.outputs)
             sides.append(CanLink(loaded.config.can, gateway, Poller(), FaultLog()))
         sides[0].open(0, wait=True)
         names = "messages from 680h on|CANopen node 42|29-bit ids with 2Ah .*"
@@ -167,7 +167,7 @@ def waiting_gateway(monkeypatch: pytest.MonkeyPatch) -> CanLink:
         "esc": [{"port": "p"}],
     }
     loaded = assemble(parse(tables, "test"))
-    gateway = Gateway(loaded.escs, loaded.layout, 0, outputs=loaded.outputs)
+    gateway = Gateway(loaded.core_settings, 0, outputs=loaded.outputs)
     monkeypatch.setattr(can_opener, "open_can", lambda _config: Bus(World()))
     monkeypatch.setattr(can_controller, "link_monitor", lambda _name: None)
     link = CanLink(loaded.config.can, gateway, World().poller, FaultLog())

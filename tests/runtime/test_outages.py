@@ -18,6 +18,7 @@ from kontronik_can_gw.capture.recorded_gateway import RecordedGateway, state_of
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.core.output_setup import OutputMaker
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dronecan.node_setup import Given
 from kontronik_can_gw.dronecan.setup import DronecanSetup
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -92,7 +93,7 @@ class Recorded:
     def replayed(self) -> list[TimedFrame]:
         """Return the frames of a replay by the core in Python."""
         self._patch.setattr(load, "library", lambda: (None, ""))
-        gateway = Gateway(ESCS, self.layout, self.begun, outputs=self.outputs)
+        gateway = Gateway(CoreSettings(ESCS, self.layout), self.begun, outputs=self.outputs)
         replay = Replay(gateway)
         frames = list(replay.follow(self.entries))
         assert replay.rejected == 0
@@ -227,9 +228,10 @@ def test_a_blocked_interface_that_is_restarted_sends_no_old_value(
 
 
 def test_a_recording_that_begins_in_an_outage_holds_frames_in_its_replay() -> None:
-    gateway = RecordedGateway(lambda *_: None, ESCS, layout_of(ESCS), 0)
+    settings = CoreSettings(ESCS, layout_of(ESCS))
+    gateway = RecordedGateway(lambda *_: None, settings, 0)
     gateway.start(0)
     gateway.hold(0)
-    replayed = Gateway(ESCS, layout_of(ESCS), 0)
+    replayed = Gateway(settings, 0)
     Replay(replayed, state_of(gateway))
     assert replayed.is_held

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from statistics_bench import moment_of
 
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
@@ -32,7 +33,7 @@ PATIENCE = 60.0
 
 def numbered(number: int) -> Moment:
     """Return the Moment of a gateway that has sent this number of frames."""
-    gateway = Gateway([EscSettings("esc1")], Layout("", "", ()), 0)
+    gateway = Gateway(CoreSettings([EscSettings("esc1")], Layout("", "", ())), 0)
     gateway.status.sent_frames = number
     gateway.status.received_frames = 3 * number
     return moment_of(gateway, number * SECOND)

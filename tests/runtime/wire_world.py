@@ -15,6 +15,7 @@ from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.core.output_setup import OutputMaker
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
@@ -473,7 +474,7 @@ def loop_in(
         restart_after_s=restart_after_s,
     )
     gateway = Gateway(
-        escs, layout, world.now, outputs=outputs, quiet_after_ns=config.quiet_after_ns
+        CoreSettings(escs, layout, quiet_after_ns=config.quiet_after_ns), world.now, outputs=outputs
     )
     paths = list(by_path)
     poller = native_world.FakeNativePoller(world, gateway) if in_c else world.poller

@@ -16,6 +16,7 @@ from kontronik_can_gw.capture.format import Entry
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.core.output import Output, OutputHost
 from kontronik_can_gw.core.output_setup import OutputMaker, ReadyOutput
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.recordings.fields import TableColumn
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import Input, PlayedBlock, RowBlock, Sample, timed
@@ -143,7 +144,9 @@ class PlayedInput(Input):
             for own, shown in zip(self.setup.escs, self.bus.escs, strict=True)
         ]
         changing = [setup for setup in self.setup.outputs if setup.changes_escs]
-        return Gateway(escs, NO_MESSAGES, self.created_ns, outputs=[*changing, *readers])
+        return Gateway(
+            CoreSettings(escs, NO_MESSAGES), self.created_ns, outputs=[*changing, *readers]
+        )
 
     def _player_of(
         self, make: Callable[[Sequence[OutputMaker]], Gateway], fields: Sequence[TableColumn] | None

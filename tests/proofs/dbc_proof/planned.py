@@ -20,6 +20,7 @@ from specification.quantities import (
 from dbc_proof.end_to_end import CrcRule, rule_of_c, rule_of_python
 from dbc_proof.sending import Sending
 from kontronik_can_gw.core.messages import Traits
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc import values
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -137,9 +138,7 @@ class PlannedMessage:
     """Numbers of the core in C that contradict each other."""
 
 
-def of_python(
-    plan: MessagePlan, escs: Sequence[EscSettings], is_silent: bool = False
-) -> PlannedMessage:
+def of_python(plan: MessagePlan, settings: CoreSettings) -> PlannedMessage:
     """Return a message as signals/packer.py packs it."""
     crc = next((signal for signal in plan.signals if signal.role is Role.CRC), None)
     constants = {}
@@ -157,13 +156,13 @@ def of_python(
             modulus = alive_modulus(signal, plan.e2e)
             made = PlannedSignal(signal.name, signal.page, signal.pieces, None, modulus)
         elif signal.role is Role.SOURCE:
-            protocol = protocol_named(escs[signal.esc or 0].protocol)
+            protocol = protocol_named(settings.escs[signal.esc or 0].protocol)
             planned = _python_plan(signal, _offsets(protocol.wire))
             made = PlannedSignal(signal.name, signal.page, signal.pieces, planned)
         else:
             continue
         signals.append(made)
-    traits = Traits(plan, is_silent)
+    traits = Traits(plan, settings)
     return PlannedMessage(
         can_id=plan.can_id,
         extended=plan.extended,

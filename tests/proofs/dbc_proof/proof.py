@@ -23,6 +23,7 @@ from dbc_proof.planned import (
     wrong_tables,
 )
 from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.native.tables import Tables
@@ -84,12 +85,13 @@ class Proof:
         self._escs = escs
         self._expected = [*expected_messages(database, escs, settings)]
         self._prover = Prover(escs)
-        self._is_silent = settings.silent_on_loss
+        is_silent = settings.silent_on_loss
+        self._core_settings = CoreSettings(escs, layout, is_silent, quiet_after_ns)
         self._quiet_after_ns = quiet_after_ns
         self.tables: Tables | None = None
         """The numbers that the core in C gets. None if it cannot send the layout."""
         try:
-            self.tables = Tables(layout, escs, self._is_silent, quiet_after_ns)
+            self.tables = Tables(self._core_settings)
         except NotInCore as error:
             self.findings.only_python = str(error)
 
@@ -110,7 +112,7 @@ class Proof:
                 self.findings.refuted.append(f"{expected.name}: is sent {len(numbers)} times")
             number = numbers[0]
             plan = self._layout.messages[number]
-            cores = [of_python(plan, self._escs, self._is_silent)]
+            cores = [of_python(plan, self._core_settings)]
             if self.tables is not None:
                 cores.append(of_c(plan, number, self.tables, expected.pages))
             self._prover.prove(expected, cores, self.findings)

@@ -1,0 +1,26 @@
+"""The settings of a core: one object, which both cores and the export get."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.signals.plan import Layout
+
+
+@dataclass(frozen=True)
+class CoreSettings:
+    """Everything that a core is told at its start.
+
+    It is made from a configuration (``assembly/assemble.py``) or from a capture's header
+    (``assembly/capture_setup.py``).
+    """
+
+    escs: Sequence[EscSettings]
+    layout: Layout
+    """The messages of the DBC. They may be none."""
+    silent_on_loss: bool = False
+    """Messages stop while telemetry is lost (``core/messages.py: Traits``)."""
+    quiet_after_ns: int = 0
+    """Time without telemetry after which quiet mode begins. 0: never."""
+    slots: int = 0
+    """Number of slots of each ESC for which the core in C has room. Python runs further ones."""
