@@ -11,14 +11,15 @@ from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import Eds
 from kontronik_can_gw.canopen.storage import APPLICATION, Stored
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import (
+    CELL_COUNTS,
+    TIMEOUTS_MS,
+    WRITTEN_POLE_PAIRS,
+    EscSettings,
+)
 from kontronik_can_gw.times import MS
 
 _SELF_START_OFF = 4
-# These limits hold whatever the EDS allows.
-_MIN_TIMEOUT_MS = 20
-_MAX_TIMEOUT_MS = 60_000
-_MAX_CELLS = 0xFF
 
 
 @dataclass(frozen=True)
@@ -57,12 +58,16 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
     held = {}
     for sub, own in _entries(base).items():
         held[sub] = dictionary.number(at.SETTINGS, sub, own)
+    # These limits hold whatever the EDS allows.
+    shortest_ms, longest_ms = TIMEOUTS_MS
+    fewest_pole_pairs, _ = WRITTEN_POLE_PAIRS
+    _, most_cells = CELL_COUNTS
     return replace(
         base,
-        pole_pairs=max(1, held[1]),
+        pole_pairs=max(fewest_pole_pairs, held[1]),
         gear=Fraction(held[2] or 1, held[3] or 1),
-        timeout_ns=min(max(_MIN_TIMEOUT_MS, held[4]), _MAX_TIMEOUT_MS) * MS,
-        cell_count=min(held[7], _MAX_CELLS),
+        timeout_ns=min(max(shortest_ms, held[4]), longest_ms) * MS,
+        cell_count=min(held[7], most_cells),
         crc_error_threshold=held[8],
     )
 

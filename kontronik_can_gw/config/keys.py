@@ -34,7 +34,7 @@ from kontronik_can_gw.config.output_keys import (
     DronecanConfig,
 )
 from kontronik_can_gw.esc.protocols import PROTOCOLS, device_names, protocol_named, protocol_names
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import CELL_COUNTS, POLE_PAIRS, TIMEOUTS_MS, EscSettings
 from kontronik_can_gw.status import UNCONFIGURED
 from kontronik_can_gw.times import MS, SECOND
 
@@ -186,14 +186,14 @@ class EscConfig:
     name: str = key(ESC_NAME, "",
         "short name, which becomes a prefix of messages and signals if there are several ESCs. "
         "The shipped DBC has room for 6 letters (default: esc1, esc2 ...)")
-    pole_pairs: int = key(integer(1, 100), 1,
+    pole_pairs: int = key(integer(*POLE_PAIRS), 1,
         "pole pairs of the motor (half the number of magnets)")
     gear: Fraction = key(RATIO, Fraction(1),
         "motor revolutions per revolution of the gear's output: "
         "a number or 'numerator/denominator'")
-    cell_count: int = key(integer(0, 255), 0,
+    cell_count: int = key(integer(*CELL_COUNTS), 0,
         "cells of the battery. 0: the number that the ESC reports")
-    telemetry_timeout_ms: int = key(integer(20, 60_000, "ms"), 250,
+    telemetry_timeout_ms: int = key(integer(*TIMEOUTS_MS, "ms"), 250,
         "age in milliseconds above which live values are not available")
     node_id: int | None = key(NODE_ID, None,
         "CANopen node-ID of this ESC. "

@@ -12,7 +12,12 @@ from typing import Any
 
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.telemetry import EscSettings
+from kontronik_can_gw.esc.telemetry import (
+    CELL_COUNTS,
+    WRITTEN_POLE_PAIRS,
+    WRITTEN_TIMEOUTS_MS,
+    EscSettings,
+)
 from kontronik_can_gw.times import MS
 
 _UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError)
@@ -84,12 +89,13 @@ def esc_of(found: Mapping[str, Any]) -> EscSettings:
         whole_number(numerator, 1, _MAX_GEAR),
         whole_number(denominator or "1", 1, _MAX_GEAR),
     )
+    shortest_ms, longest_ms = WRITTEN_TIMEOUTS_MS
     return EscSettings(
         name=short_text(found["name"], _MAX_NAME),
-        pole_pairs=whole_number(found["pole_pairs"], 1, 0xFFFF),
+        pole_pairs=whole_number(found["pole_pairs"], *WRITTEN_POLE_PAIRS),
         gear=gear,
-        cell_count=whole_number(found["cell_count"], 0, 255),
-        timeout_ns=whole_number(found["timeout_ns"], MS, 65_536 * MS),
+        cell_count=whole_number(found["cell_count"], *CELL_COUNTS),
+        timeout_ns=whole_number(found["timeout_ns"], shortest_ms * MS, longest_ms * MS),
         crc_error_threshold=whole_number(found["crc_error_threshold"], 0, 0xFFFF_FFFF),
         # Captures of 0.5.0 name no protocol.
         protocol=protocol_named(found.get("protocol")).name,

@@ -61,6 +61,15 @@ class Event:
     """Quiet mode of the gateway began or ended. It is reported for ESC 0."""
 
 
+POLE_PAIRS = (1, 100)
+CELL_COUNTS = (0, 0xFF)
+TIMEOUTS_MS = (20, 60_000)
+"""Smallest and greatest setting of an ESC, in a configuration and for use."""
+WRITTEN_POLE_PAIRS = (1, 0xFFFF)
+WRITTEN_TIMEOUTS_MS = (1, 1 << 16)
+"""Limits of settings in captures: of the objects to which a CANopen master writes them (2100h)."""
+
+
 @dataclass(frozen=True)
 class EscSettings:
     """The user's settings of one ESC and its drive train."""
@@ -72,7 +81,7 @@ class EscSettings:
     cell_count: int = 0
     """0: the number that the ESC reports is used."""
     timeout_ns: int = 250 * MS
-    """Live data older than this is not available. 20 ms to 60 s."""
+    """Live data older than this is not available (``TIMEOUTS_MS``)."""
     crc_error_threshold: int = 5
     """A link with this many CRC errors within a second is DEGRADED."""
     protocol: str = PROTOCOLS[0].name
