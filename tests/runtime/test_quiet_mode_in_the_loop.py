@@ -219,3 +219,18 @@ def test_an_interface_that_returns_in_quiet_mode_gets_no_frame(
     assert lines[0] == "CAN world: quiet: no ESC was heard for 3 s, so only requests are answered"
     assert lines[1].startswith("CAN world: quiet mode ends: an ESC is heard, after ")
     bench.loop.close()
+
+
+@pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
+def test_the_begin_and_the_end_of_quiet_mode_are_logged_at_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    bench = Bench(monkeypatch)
+    bench.run(QUIET_AFTER_S + 0.5)
+    lines = [record.message for record in caplog.records if "quiet" in record.message]
+    assert lines == ["CAN world: quiet: no ESC was heard for 3 s, so only requests are answered"]
+    bench.live(0.5)
+    lines = [record.message for record in caplog.records if "quiet mode ends" in record.message]
+    assert len(lines) == 1
+    bench.loop.close()
