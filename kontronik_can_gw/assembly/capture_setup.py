@@ -9,8 +9,10 @@ JSON keys of the header::
     file             the path of the configuration
     escs             settings of each ESC that were in effect, with a gear such as "31/4"
     ports            the serial ports of the ESCs
-    dbc              file, text (one character a byte), fd, silent_on_loss and the keys of [dbc].
-                     null without a DBC
+    dbc              file, text (one character a byte), fd, silent_on_loss, likely_data_ids and
+                     the keys of [dbc]. null without a DBC. likely_data_ids is true if E2E data IDs
+                     of unusual attributes, and of messages without a profile, were used. It is
+                     missing in captures of 0.5.0
     canopen          eds (file, text), nodes, stored, escs (settings as configured).
                      null without nodes
     outputs          the other outputs by name, each with table (as in the configuration),
@@ -45,6 +47,7 @@ from kontronik_can_gw.core.header_parts import (
 from kontronik_can_gw.core.output_setup import OUTPUTS, OutputSetup, setup_module
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.prepare import prepare
+from kontronik_can_gw.dbc.protection import remove_later_data_ids
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
@@ -98,6 +101,8 @@ class CaptureSetup:
     """The version of the capture's format. 0.5.0 wrote version 1."""
     outputs: tuple[OutputSetup, ...] = ()
     quiet_after_ns: int = 0
+    has_likely_data_ids: bool = True
+    """False if the run did not use E2E data IDs that 0.5.0 did not use either."""
 
     def header(self) -> dict[str, Any]:
         """Return the header's JSON content."""
@@ -128,6 +133,7 @@ class CaptureSetup:
         settings = self.dbc_settings
         found = {"file": file, "text": data.decode("latin-1"), "fd": self.fd}
         found["silent_on_loss"] = settings.silent_on_loss
+        found["likely_data_ids"] = self.has_likely_data_ids
         for key, name in _DBC_KEYS.items():
             found[name] = getattr(settings, key)
         return found
@@ -171,6 +177,7 @@ class CaptureSetup:
             version=header["version"],
             outputs=_outputs_of(header, escs),
             quiet_after_ns=whole_number(header.get("quiet_after_ns", 0), 0, END_OF_TIME - 1),
+            has_likely_data_ids=bool(dbc and dbc.get("likely_data_ids")),
         )
 
     def database(self) -> tuple["Database", Layout] | None:
@@ -179,6 +186,8 @@ class CaptureSetup:
             return None
         name, data = self.dbc
         database = parse_database(data, name)
+        if not self.has_likely_data_ids:
+            remove_later_data_ids(database, self.dbc_settings)
         return database, prepare(database, name, self.escs, self.dbc_settings, self.fd)
 
     def gateway(self, layout: Layout, now: int) -> Gateway:

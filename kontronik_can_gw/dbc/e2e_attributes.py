@@ -132,6 +132,15 @@ def with_data_ids(attributes: Mapping[str, object], data_ids: Sequence[int]) -> 
     return changed
 
 
+def remove_data_ids(message: "Message", only_likely: bool) -> None:
+    """Remove a message's data IDs, or only those in attributes that no rule defines."""
+    wanted = _LIKELY_DATA_IDS if only_likely else _LIKELY_DATA_IDS | _DATA_IDS
+    owners: list[Any] = [message, *message.signals]
+    for owner in owners:
+        for name in _own_names(owner, wanted):
+            del owner.dbc.attributes[name]
+
+
 def protected_bits_of(message: "Message", database: "Database") -> int | None:
     """Return the protected length in bits that the DBC states for a message, or None."""
     for _, value in _values(message, database, _LENGTH):

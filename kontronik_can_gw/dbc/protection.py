@@ -4,6 +4,7 @@ In this order: [dbc.e2e], the attributes of the DBC, [dbc.e2e_data_ids] alone, a
 and counter.
 """
 
+import contextlib
 import fnmatch
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -114,6 +115,18 @@ def assumed_data_ids(settings: DbcConfig, database: "Database", copy: Copy) -> t
     except UnclearAttribute:
         return _can_id_as_data_id(copy)
     return found if _is_usable(found, _DEFAULT) else _can_id_as_data_id(copy)
+
+
+def remove_later_data_ids(database: "Database", settings: DbcConfig) -> None:
+    """Remove the data IDs that 0.5.0 did not use, so that its captures replay as they were sent.
+
+    0.5.0 used only the attributes that a rule defines, and only of messages with a profile.
+    """
+    for message in database.messages:
+        has_profile = any(fnmatch.fnmatchcase(message.name, each) for each in settings.e2e)
+        with contextlib.suppress(UnclearAttribute):
+            has_profile = has_profile or e2e_attributes.profile_of(message, database) is not None
+        e2e_attributes.remove_data_ids(message, only_likely=has_profile)
 
 
 def _is_usable(data_ids: Sequence[int] | None, profile: Profile) -> bool:

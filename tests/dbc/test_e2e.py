@@ -399,6 +399,52 @@ def test_a_capture_keeps_profiles_and_data_ids() -> None:
 # --- statements of the DBC
 
 
+@pytest.mark.parametrize(
+    ("name", "profile", "data_id", "e2e", "sent_now", "sent_by_0_5_0"),
+    [
+        ("DataID", "P01", 7, {}, 7, 0x123),
+        ("E2EIdentifier", "P01", 7, {}, 0x123, 0x123),
+        ("E2EDataId", "P01", 7, {}, 7, 7),
+        ("E2EDataId", None, 7, {}, 7, 0x123),
+        ("E2EDataId", None, 7, {"M": "1A"}, 7, 7),
+        ("DataId", None, 7, {"*": "1A"}, 7, 0x123),
+    ],
+)
+@pytest.mark.parametrize("owner", ["BO_ 291", "SG_ 291 M_CRC"])
+def test_a_capture_replays_with_the_data_id_that_was_sent(
+    name: str,
+    profile: str | None,
+    data_id: int,
+    e2e: dict[str, str],
+    sent_now: int,
+    sent_by_0_5_0: int,
+    owner: str,
+) -> None:
+    """0.5.0 ignored data IDs of unusual attributes, and of messages without a profile."""
+    text = layout_text("1A") + attributes(profile, data_id, owner).replace("E2EDataId", name)
+    dbc = ("my.dbc", text.encode())
+    settings = DbcConfig(e2e=e2e, bind={"M_CRC": "crc"})
+    setup = CaptureSetup((EscSettings(),), ("-",), dbc, settings, False)
+
+    def sent(header: dict[str, Any]) -> tuple[int, ...]:
+        found = CaptureSetup.of(header).database()
+        assert found is not None
+        (plan,) = found[1].messages
+        assert plan.e2e is not None
+        return plan.e2e.data_ids
+
+    def written(setup: CaptureSetup) -> dict[str, Any]:
+        header: dict[str, Any] = json.loads(json.dumps(setup.header()))
+        return header
+
+    header = written(setup)
+    assert sent(header) == (sent_now,)
+    assert sent(written(CaptureSetup.of(header))) == (sent_now,)
+    del header["dbc"]["likely_data_ids"]
+    assert sent(header) == (sent_by_0_5_0,)
+    assert sent(written(CaptureSetup.of(header))) == (sent_by_0_5_0,)
+
+
 def attributes(profile: str | None, data_id: object, owner: str = "BO_ 291") -> str:
     """Return attributes as OEMs write them, of a message or of a signal."""
     kind = owner.split()[0]
