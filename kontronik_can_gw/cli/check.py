@@ -1,6 +1,7 @@
 """``check``: reports if a configuration can be used and what it sends. It opens no port."""
 
 import argparse
+import contextlib
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ from kontronik_can_gw.dbc.reader import listed
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.printable import printable_json
+from kontronik_can_gw.runtime.status.statistics import NOT_OURS, has_other_content
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import UNCONFIGURED
 
@@ -49,7 +51,7 @@ def main(args: argparse.Namespace) -> int:
         for number, esc in enumerate(loaded.config.esc, 1)
         if _EXAMPLE_PORT in esc.port
     ]
-    warnings = [*loaded.layout.warnings, *loaded.warnings, *examples]
+    warnings = [*loaded.layout.warnings, *loaded.warnings, *examples, *_file_warnings(loaded)]
     shown = document(path, loaded, warnings)
     if args.json:
         print(printable_json(shown, indent=2))
@@ -62,6 +64,19 @@ def main(args: argparse.Namespace) -> int:
         for line in details(loaded):
             show(line)
     return 0
+
+
+def _file_warnings(loaded: Loaded) -> Iterator[str]:
+    """Yield a warning if the status cannot be written, because the file is not the gateway's."""
+    file = loaded.config.statistics_path
+    if file is None:
+        return
+    with contextlib.suppress(OSError):  # unreadable for this user, which is not the service's
+        if file.is_file() and has_other_content(file):
+            yield (
+                f"{loaded.config.file}: statistics.file: the status is not written to {file}: "
+                f"{NOT_OURS}"
+            )
 
 
 def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
@@ -80,8 +95,6 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     if can.fd:
         rate += f", data {can.data_bitrate // 1000} kbit/s"
     yield f"  CAN       {can.channel} ({can.interface}), {rate}"
-    if can.restart_after_s:
-        yield f"            restarted after {can.restart_after_s:g} s in which no frame is sent"
     if can.quiet_after_s:
         yield f"            quiet after {can.quiet_after_s} s without telemetry"
     if can.restart_after_s and can.interface == "socketcan":

@@ -193,3 +193,23 @@ def test_check_shows_who_can_restart_the_interface(tmp_path: Path) -> None:
     assert done.code == 0
     assert "restarted after 0.5 s in which no frame has left,\n" in done.out
     assert "if root or the service's user runs the gateway\n" in done.out
+
+
+def test_check_shows_one_time_until_a_restart(tmp_path: Path) -> None:
+    text = "[can]\nrestart_after_s = 0.5\n[[esc]]\nport = '/dev/ttyS0'\n"
+    done = run("check", "-c", written(tmp_path / "gateway.toml", text))
+    assert done.out.count("restarted after") == 1
+
+
+@pytest.mark.parametrize(("content", "warnings"), [("mine\n", 1), ("", 0), (None, 0)])
+def test_check_warns_of_a_status_file_that_is_the_users(
+    content: str | None, warnings: int, tmp_path: Path
+) -> None:
+    file = tmp_path / "notes.txt"
+    if content is not None:
+        written(file, content)
+    text = f"[statistics]\nfile = '{file}'\n[[esc]]\nport = '/dev/ttyS0'\n"
+    done = run("check", "-c", written(tmp_path / "gateway.toml", text))
+    assert done.code == 0
+    said = f"statistics.file: the status is not written to {file}: it exists and is not a status"
+    assert done.err.count(said) == warnings

@@ -89,7 +89,11 @@ def _lock_name(file: Path) -> str:
     return f"{os.path.realpath(file)}/statistics/0"
 
 
-def _has_other_content(path: Path) -> bool:
+NOT_OURS = "it exists and is not a status file. Remove it, or choose another name"
+"""The reason why a file is not replaced."""
+
+
+def has_other_content(path: Path) -> bool:
     """Return True if a file has content that no gateway has written as its status."""
     try:
         with path.open("rb") as file:
@@ -172,9 +176,8 @@ class Statistics:
             # os.path and os.replace are cheaper than pathlib, and this runs every second.
             if not os.path.isfile(path) and path.exists():  # noqa: PTH113
                 raise OSError(errno.EINVAL, "it is not a regular file")  # e.g. /dev/null
-            if not self._is_ours and _has_other_content(path):
-                reason = "it exists and is not a status file. Remove it, or choose another name"
-                raise OSError(errno.EEXIST, reason)
+            if not self._is_ours and has_other_content(path):
+                raise OSError(errno.EEXIST, NOT_OURS)
             write_new(temporary, data, 0o644, is_synced=True)
             os.replace(temporary, path)  # noqa: PTH105
         except OSError as error:
