@@ -144,6 +144,16 @@ def test_numbers_come_before_details_and_help_before_plots(flight: Flight) -> No
     assert places == sorted(places)
 
 
+def test_noisy_curves_of_two_escs_do_not_cover_each_other() -> None:
+    bus = layout_of(["left", "right"])
+    plots = data_of(render(flight_of(bus, simulated(bus, 6)), source="y"))["plots"]
+    escs = {plot["key"]: [series["esc"] for series in plot["series"]] for plot in plots}
+    assert escs["battery_voltage"] == [0, 1]
+    for key in ("bec_voltage", "bec_current"):
+        assert escs[key] == [0]
+        assert escs[f"{key}-1"] == [1]
+
+
 def test_a_gap_of_years_is_cut_out_and_noted() -> None:
     """A board without a battery for its clock records, and its time is set meanwhile."""
     bus = layout_of(["esc1"])

@@ -134,7 +134,7 @@ def _plots(flight: Flight) -> Iterator[dict[str, Any]]:
     """Yield the plots that have data.
 
     If the sizes of a plot's lines differ, they are drawn in separate plots, unless they have the
-    same shape.
+    same shape. Noisy lines of several ESCs are drawn in a plot for each ESC.
     """
     for plot in PLOTS:
         lines: Lines = {}
@@ -145,20 +145,30 @@ def _plots(flight: Flight) -> Iterator[dict[str, Any]]:
         groups = of_like_size(tops)
         if plot.has_one_shape and tops:
             groups = [[*tops]]
-        for index, sources in enumerate(groups):
+        number = 0
+        for sources in groups:
             labels = [plot.lines[source] for source in sources]
             title = plot.title
             if len(groups) > 1:
                 title = f"{', '.join(labels)} {plot.title[0].lower()}{plot.title[1:]}"
-            yield {
-                "key": f"{plot.key}-{index}" if index else plot.key,
-                "title": title,
-                "note": _note_on_shape(labels) if plot.has_one_shape else "",
-                "unit": VALUES[sources[0]].unit,
-                "digits": plot.digits,
-                "lines": labels,
-                "series": list(_series(plot, lines, sources)),
-            }
+            series = [*_series(plot, lines, sources)]
+            for drawn in _apart(series) if plot.is_noisy else [series]:
+                yield {
+                    "key": f"{plot.key}-{number}" if number else plot.key,
+                    "title": title,
+                    "note": _note_on_shape(labels) if plot.has_one_shape else "",
+                    "unit": VALUES[sources[0]].unit,
+                    "digits": plot.digits,
+                    "lines": labels,
+                    "series": drawn,
+                }
+                number += 1
+
+
+def _apart(series: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Return the series of each ESC."""
+    escs = dict.fromkeys(each["esc"] for each in series)
+    return [[each for each in series if each["esc"] == esc] for esc in escs]
 
 
 def _top(line: Mapping[int, Sequence[Number]]) -> float:

@@ -21,6 +21,8 @@ class Plot(NamedTuple):
 
     Only one of them is drawn. The cursor shows the values of all.
     """
+    is_noisy: bool = False
+    """True if the values vary so fast that ESCs would cover each other. Each has its own plot."""
 
 
 # fmt: off
@@ -46,8 +48,8 @@ PLOTS = (
         {"throttle": "Throttle", "output_opening": "Opening"},
     ),
     Plot("pwm", "PWM input", 0, {"pwm_input": "PWM input"}),
-    Plot("bec_voltage", "BEC voltage", 3, {"bec_voltage": "BEC voltage"}),
-    Plot("bec_current", "BEC current", 3, {"bec_current": "BEC current"}),
+    Plot("bec_voltage", "BEC voltage", 3, {"bec_voltage": "BEC voltage"}, is_noisy=True),
+    Plot("bec_current", "BEC current", 3, {"bec_current": "BEC current"}, is_noisy=True),
 )
 # fmt: on
 DRAWN = tuple(source for plot in PLOTS for source in plot.lines)
