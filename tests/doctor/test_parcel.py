@@ -22,7 +22,15 @@ from doctor_trees import Tree
 from rights import modes_apply
 
 from kontronik_can_gw.assembly.assemble import load_configuration
-from kontronik_can_gw.capture.format import SUFFIX, Block, EntryKind, Scanner, block, read_json
+from kontronik_can_gw.capture.format import (
+    SUFFIX,
+    Block,
+    EntryKind,
+    Scanner,
+    block,
+    json_payload,
+    read_json,
+)
 from kontronik_can_gw.cli.parcel import capture_folders
 from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.keys import shipped
@@ -172,6 +180,25 @@ def test_options_leave_out_captures_and_the_dbc(setup: Path) -> None:
     header = read_json(blocks(files["captures/newest.kcap"])[0].payload)
     assert header["dbc"] is None
     assert header["canopen"]["eds"]["text"]
+
+
+def test_holes_of_a_sparse_capture_are_not_read(setup: Path, tmp_path: Path) -> None:
+    """Reading 8 TB of zeros would take hours. A block behind the hole is kept."""
+    path = tmp_path / "captures" / f"newest{SUFFIX}"
+    behind = block(b"I", 7, json_payload({"devices": []}))
+    end = 1 << 43
+    with path.open("r+b") as file:
+        begin = file.read()
+        try:
+            file.seek(end // 2)
+            file.write(behind)
+            file.truncate(end)
+        except OSError as error:
+            pytest.skip(f"this file system has no sparse file of 8 TB: {error}")
+    done, files = parcel(setup)
+    assert done.code == 0, done.err
+    kept = [found.number for found in blocks(files[f"captures/{path.name}"])]
+    assert kept == [found.number for found in blocks(begin)] + [7]
 
 
 def test_an_existing_file_is_kept_without_force(setup: Path) -> None:

@@ -3,6 +3,7 @@
 A part that cannot be made is a line in ``Contents.missing``, and the others are made nevertheless.
 """
 
+import errno
 import hashlib
 import os
 import platform
@@ -10,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
+from io import FileIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -264,12 +266,31 @@ def _capture(
 
     def chunks() -> Iterator[bytes]:
         contents.cleaner.begin(name)
-        with path.open("rb") as file:
-            data: Iterator[bytes] = iter(lambda: file.read(_CHUNK), b"")
-            data = watch(data, name)
+        with path.open("rb", buffering=0) as file:
+            data = watch(_without_holes(file), name)
             yield from clean_capture(data, name, contents.cleaner, with_dbc=with_dbc)
 
     return BundlePart(name, path.stat().st_size, chunks)
+
+
+def _without_holes(file: FileIO) -> Iterator[bytes]:
+    """Yield the content of a file. Of a hole in a sparse file, at most two chunks of zeros."""
+    was_zeros = False
+    while data := file.read(_CHUNK):
+        is_zeros = data == bytes(len(data))
+        if is_zeros and was_zeros:
+            file.seek(_next_data(file))
+        was_zeros = is_zeros
+        yield data
+
+
+def _next_data(file: FileIO) -> int:
+    """Return the position of the next data of a file, which is its end behind its last data."""
+    here = file.tell()
+    try:
+        return os.lseek(file.fileno(), here, os.SEEK_DATA)
+    except OSError as error:
+        return max(here, os.fstat(file.fileno()).st_size) if error.errno == errno.ENXIO else here
 
 
 # --- versions
