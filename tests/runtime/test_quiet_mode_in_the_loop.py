@@ -221,7 +221,6 @@ def test_an_interface_that_returns_in_quiet_mode_gets_no_frame(
     bench.loop.close()
 
 
-@pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
 def test_the_begin_and_the_end_of_quiet_mode_are_logged_at_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
