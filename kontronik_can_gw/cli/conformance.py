@@ -11,8 +11,8 @@ from kontronik_can_gw.desk.conformance.bench import slave_on_bus
 from kontronik_can_gw.desk.conformance.items import Item
 from kontronik_can_gw.desk.conformance.run import (
     GATEWAY_DEVIATIONS,
+    ItemVerdict,
     Result,
-    Verdict,
     all_items,
     chosen_items,
     counts,
@@ -96,7 +96,7 @@ def main(args: argparse.Namespace) -> int:
         xml = junit(results, f"CANopen conformance of {eds.name}")
         write_output(args.junit, xml.decode("utf-8"), force=args.force)
     say(counts(results), args.command)
-    return 1 if any(result.verdict is Verdict.FAILED for result in results) else 0
+    return 1 if any(result.verdict is ItemVerdict.FAILED for result in results) else 0
 
 
 def _results(slave: Slave, items: list[Item], deviations: dict[str, str]) -> list[Result]:

@@ -20,7 +20,7 @@ from kontronik_can_gw.desk.conformance.nmt_items import (
     state_name,
 )
 from kontronik_can_gw.desk.conformance.sdo_items import VALUE_RANGE
-from kontronik_can_gw.desk.conformance.slave import Abort, Frame, NoAnswer, Slave
+from kontronik_can_gw.desk.conformance.slave import NoAnswer, ReceivedFrame, SdoAbort, Slave
 
 _HISTORY = 0x1003
 _ERROR_REGISTER = 0x1001
@@ -52,7 +52,7 @@ def _heartbeat_of_monitored_node(slave: Slave) -> None:
     slave.send(0x700 + _MONITORED_NODE, bytes((OPERATIONAL,)))
 
 
-def _lose_heartbeat(slave: Slave) -> Frame:
+def _lose_heartbeat(slave: Slave) -> ReceivedFrame:
     """Provoke a lost heartbeat. Return the emergency."""
     cob_id = _cob_id(slave)
     _monitor(slave)
@@ -63,7 +63,7 @@ def _lose_heartbeat(slave: Slave) -> Frame:
         raise Wrong("no emergency") from None
 
 
-def _code(frame: Frame) -> int:
+def _code(frame: ReceivedFrame) -> int:
     return int.from_bytes(frame.data[:2], "little")
 
 
@@ -153,7 +153,7 @@ def emcy_disabled(slave: Slave) -> str:
     cob_id = _cob_id(slave)
     try:
         slave.write_number(_COB_ID, 0, 1 << 31 | cob_id)
-    except Abort as abort:
+    except SdoAbort as abort:
         raise Skipped(f"1014h cannot be disabled ({abort})") from None
     _monitor(slave)
     _heartbeat_of_monitored_node(slave)

@@ -3,7 +3,7 @@
 from kontronik_can_gw.desk.conformance.eds_items import number_of, sections_of
 from kontronik_can_gw.desk.conformance.items import Skipped, Wrong, item, require
 from kontronik_can_gw.desk.conformance.nmt_items import RESET_COMMUNICATION, RESET_NODE
-from kontronik_can_gw.desk.conformance.slave import Frame, NoAnswer, Slave
+from kontronik_can_gw.desk.conformance.slave import NoAnswer, ReceivedFrame, Slave
 
 _TO_SLAVE = 0x7E5
 _FROM_SLAVE = 0x7E4
@@ -45,11 +45,11 @@ def _ask(slave: Slave, command: int, data: bytes = b"") -> bytes:
     return _answer(slave).data
 
 
-def _answer(slave: Slave) -> Frame:
+def _answer(slave: Slave) -> ReceivedFrame:
     return slave.wait_for(lambda frame: frame.can_id == _FROM_SLAVE)
 
 
-def _answers_until_sdo(slave: Slave) -> list[Frame]:
+def _answers_until_sdo(slave: Slave) -> list[ReceivedFrame]:
     return [frame for frame in slave.frames_until_answer() if frame.can_id == _FROM_SLAVE]
 
 

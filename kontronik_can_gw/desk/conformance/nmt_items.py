@@ -1,7 +1,7 @@
 """NMT, boot-up and heartbeat: CiA 301, 7.2.8 and 7.3.2."""
 
 from kontronik_can_gw.desk.conformance.items import Skipped, item, require, require_abort
-from kontronik_can_gw.desk.conformance.slave import Frame, Slave
+from kontronik_can_gw.desk.conformance.slave import ReceivedFrame, Slave
 
 START = 0x01
 STOP = 0x02
@@ -50,7 +50,7 @@ def require_state(slave: Slave, state: int) -> str:
     return f"heartbeats report {state_name(found)}"
 
 
-def _boot_up_answer(slave: Slave, frames: list[Frame]) -> str:
+def _boot_up_answer(slave: Slave, frames: list[ReceivedFrame]) -> str:
     seen = [frame.data for frame in frames if frame.can_id == slave.heartbeat_id]
     boot_ups = [data for data in seen if data == b"\0"]
     answer = f"{len(boot_ups)} boot-up messages"

@@ -11,7 +11,7 @@ from kontronik_can_gw.desk.conformance.sdo_items import (
     VALUE_TOO_LOW,
     is_writable,
 )
-from kontronik_can_gw.desk.conformance.slave import Abort, Frame, Slave
+from kontronik_can_gw.desk.conformance.slave import ReceivedFrame, SdoAbort, Slave
 
 _COMMUNICATION = 0x1800
 _MAPPING = 0x1A00
@@ -25,7 +25,7 @@ _OTHER_SYNC = 0x0FE
 _LIMITS = (VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW)
 
 
-class Tpdo:
+class FirstTpdo:
     """The first TPDO of the slave, which no other frame on the bus disturbs.
 
     All other TPDOs are disabled.
@@ -50,7 +50,7 @@ class Tpdo:
             self.slave.write_number(_COMMUNICATION, 5, 0)
         self.slave.write_number(_COMMUNICATION, 1, _NO_RTR | self.cob_id)
 
-    def seen_in(self, frames: list[Frame]) -> list[Frame]:
+    def seen_in(self, frames: list[ReceivedFrame]) -> list[ReceivedFrame]:
         return [frame for frame in frames if frame.can_id == self.cob_id]
 
     def count_with_syncs(self, count: int) -> int:
@@ -77,7 +77,7 @@ class Tpdo:
 
 @item("CiA 301, 7.2.2", "type 1 and 10 SYNCs in OPERATIONAL", "10 TPDOs, as long as the mapping")
 def pdo_each_sync(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.enable(1)
     slave.nmt(START)
     slave.sync()
@@ -90,7 +90,7 @@ def pdo_each_sync(slave: Slave) -> str:
 
 @item("CiA 301, 7.2.2", "type 3 and 12 SYNCs in OPERATIONAL", "4 TPDOs")
 def pdo_each_third_sync(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.enable(3)
     slave.nmt(START)
     count = tpdo.count_with_syncs(12)
@@ -104,7 +104,7 @@ def pdo_each_third_sync(slave: Slave) -> str:
     "no TPDO without a SYNC, and at most one for each SYNC",
 )
 def pdo_acyclic(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.enable(0)
     slave.nmt(START)
     without = len(tpdo.seen_in(slave.frames_during(0.2)))
@@ -116,7 +116,7 @@ def pdo_acyclic(slave: Slave) -> str:
 
 @item("CiA 301, 7.2.2", "TPDO disabled by bit 31, and SYNCs", "no TPDO")
 def pdo_disabled(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.enable(1)
     tpdo.disable()
     slave.nmt(START)
@@ -127,7 +127,7 @@ def pdo_disabled(slave: Slave) -> str:
 
 @item("CiA 301, 7.3.2.2", "type 1 and SYNCs in PRE-OPERATIONAL", "no TPDO")
 def pdo_none_in_pre_operational(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.enable(1)
     slave.nmt(ENTER_PRE_OPERATIONAL)
     count = tpdo.count_with_syncs(3)
@@ -141,7 +141,7 @@ def pdo_none_in_pre_operational(slave: Slave) -> str:
     "no TPDO",
 )
 def pdo_none_while_stopped(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.enable(1)
     slave.nmt(START)
     slave.frames_until_answer()
@@ -156,7 +156,7 @@ def pdo_none_while_stopped(slave: Slave) -> str:
 
 @item("CiA 301, 1800h:5", "type 254 with an event timer of 100 ms", "at least 8 TPDOs a second")
 def pdo_event_timer(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     if not slave.has(_COMMUNICATION, 5):
         raise Skipped("the EDS does not have 1800h:5")
     tpdo.enable(254)
@@ -169,7 +169,7 @@ def pdo_event_timer(slave: Slave) -> str:
 
 @item("CiA 301, 1800h:1", "new COB-ID while the TPDO is valid", "abort")
 def pdo_cob_id_change_while_valid(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.enable(1)
     answer = require_abort(lambda: slave.write_number(_COMMUNICATION, 1, _NO_RTR | 0x1FF))
     found = slave.number(_COMMUNICATION, 1) & 0x7FF
@@ -179,7 +179,7 @@ def pdo_cob_id_change_while_valid(slave: Slave) -> str:
 
 @item("CiA 301, 7.3.5", "restricted COB-IDs 000h, 001h, 580h + node-ID, 6E0h and 7FFh", "abort")
 def pdo_restricted_cob_ids(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     answer = ""
     for cob_id in (0x000, 0x001, 0x580 + slave.node_id, 0x6E0, 0x7FF):
         tpdo.disable()
@@ -190,7 +190,7 @@ def pdo_restricted_cob_ids(slave: Slave) -> str:
 
 @item("CiA 301, 1800h:1", "29-bit COB-ID", "accepted, or abort 06090030h")
 def pdo_extended_cob_id(slave: Slave) -> str:
-    Tpdo(slave)
+    FirstTpdo(slave)
     new = _INVALID | _NO_RTR | _EXTENDED | 0x12345
     try:
         return require_abort(lambda: slave.write_number(_COMMUNICATION, 1, new), *_LIMITS)
@@ -201,7 +201,7 @@ def pdo_extended_cob_id(slave: Slave) -> str:
 
 @item("CiA 301, 1800h:2", "reserved transmission types 241, 245 and 251", "abort")
 def pdo_reserved_types(slave: Slave) -> str:
-    Tpdo(slave)
+    FirstTpdo(slave)
     answer = ""
     for number in _RESERVED_TYPES:
         answer = require_abort(partial(slave.write_number, _COMMUNICATION, 2, number), *_LIMITS)
@@ -210,12 +210,12 @@ def pdo_reserved_types(slave: Slave) -> str:
 
 @item("CiA 301, 1800h:2", "types 252 and 253 (on a remote frame)", "accepted, or abort 06090030h")
 def pdo_remote_types(slave: Slave) -> str:
-    Tpdo(slave)
+    FirstTpdo(slave)
     answers = []
     for number in (252, 253):
         try:
             slave.write_number(_COMMUNICATION, 2, number)
-        except Abort as abort:
+        except SdoAbort as abort:
             answers.append(str(abort))
             require(abort.code in _LIMITS, str(abort))
         else:
@@ -225,7 +225,7 @@ def pdo_remote_types(slave: Slave) -> str:
 
 @item("CiA 301, 1800h:3", "new inhibit time while the TPDO is valid", "abort")
 def pdo_inhibit_time_while_valid(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     if not slave.has(_COMMUNICATION, 3):
         raise Skipped("the EDS does not have 1800h:3")
     tpdo.enable(254)
@@ -234,7 +234,7 @@ def pdo_inhibit_time_while_valid(slave: Slave) -> str:
 
 @item("CiA 301, 1A00h", "new mapping entry while sub-index 0 is not 0", "abort, nothing changes")
 def pdo_mapping_while_active(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.require_writable_mapping()
     if slave.number(_MAPPING, 0) == 0:
         raise Skipped("the first TPDO has no mapping")
@@ -250,7 +250,7 @@ def pdo_mapping_while_active(slave: Slave) -> str:
     "a TPDO with the bytes of the new object only",
 )
 def pdo_mapping_procedure(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.require_writable_mapping()
     target = next((v for v in slave.variables() if v.pdo_mappable and v.access_type != "wo"), None)
     if target is None:
@@ -269,7 +269,7 @@ def pdo_mapping_procedure(slave: Slave) -> str:
 
 def _refused_entry(slave: Slave, entry: int, *codes: int) -> str:
     """Map an entry. Both the entry and the number of entries may be refused."""
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.require_writable_mapping()
     slave.write_number(_MAPPING, 0, 0)
 
@@ -293,7 +293,7 @@ def pdo_mapping_of_an_unmappable_object(slave: Slave) -> str:
 
 @item("CiA 301, 1A00h", "mapping of more than 8 bytes", "abort 06040042h")
 def pdo_mapping_too_long(slave: Slave) -> str:
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.require_writable_mapping()
     wide = [v for v in slave.variables() if v.pdo_mappable and len(v) == 32]
     if not wide:
@@ -337,7 +337,7 @@ def sync_cob_id(slave: Slave) -> str:
     variable = slave.variable(0x1005)
     if variable is None or not is_writable(variable):
         raise Skipped("1005h cannot be written")
-    tpdo = Tpdo(slave)
+    tpdo = FirstTpdo(slave)
     tpdo.enable(1)
     slave.write_number(0x1005, 0, _OTHER_SYNC)
     slave.nmt(START)

@@ -21,7 +21,7 @@ from kontronik_can_gw.desk.conformance import (  # these modules add their items
 )
 from kontronik_can_gw.desk.conformance.items import ITEMS, Item, Skipped, Wrong
 from kontronik_can_gw.desk.conformance.nmt_items import RESET_NODE
-from kontronik_can_gw.desk.conformance.slave import Abort, NoAnswer, Slave, UnexpectedAnswer
+from kontronik_can_gw.desk.conformance.slave import NoAnswer, SdoAbort, Slave, UnexpectedAnswer
 from kontronik_can_gw.errors import UserError, did_you_mean
 
 GROUPS = (
@@ -42,7 +42,7 @@ def all_items() -> list[Item]:
     return sorted(ITEMS, key=lambda item: modules.index(item.run.__module__))
 
 
-class Verdict(Enum):
+class ItemVerdict(Enum):
     """The result of an item."""
 
     PASSED = "passed"
@@ -58,7 +58,7 @@ class Result(NamedTuple):
 
     item: Item
     answer: str
-    verdict: Verdict
+    verdict: ItemVerdict
     reason: str
     """Reason of a deviation, or ""."""
     seconds: float
@@ -104,23 +104,23 @@ def run(slave: Slave, items: Sequence[Item], deviations: Mapping[str, str]) -> I
     """Run the items one after the other. Before each one the slave is reset."""
     for item in items:
         begun = time.monotonic()
-        verdict = Verdict.PASSED
+        verdict = ItemVerdict.PASSED
         try:
             if item.run.__module__ != eds_items.__name__:
                 slave.restart(RESET_NODE)
             answer = item.run(slave)
         except Skipped as skipped:
             answer = str(skipped)
-            verdict = Verdict.SKIPPED
-        except (Wrong, Abort, UnexpectedAnswer) as error:
+            verdict = ItemVerdict.SKIPPED
+        except (Wrong, SdoAbort, UnexpectedAnswer) as error:
             answer = str(error)
-            verdict = Verdict.FAILED
+            verdict = ItemVerdict.FAILED
         except NoAnswer:
             answer = f"no answer within {slave.limit_s:g} s"
-            verdict = Verdict.FAILED
+            verdict = ItemVerdict.FAILED
         reason = ""
-        if verdict is Verdict.FAILED and item.name in deviations:
-            verdict = Verdict.DEVIATES
+        if verdict is ItemVerdict.FAILED and item.name in deviations:
+            verdict = ItemVerdict.DEVIATES
             reason = deviations[item.name]
         yield Result(item, answer, verdict, reason, time.monotonic() - begun)
 
@@ -128,7 +128,7 @@ def run(slave: Slave, items: Sequence[Item], deviations: Mapping[str, str]) -> I
 def counts(results: Sequence[Result]) -> str:
     """Return the number of items of each verdict in one line."""
     number = Counter(result.verdict for result in results)
-    parts = [f"{number[verdict]} {verdict.value}" for verdict in Verdict]
+    parts = [f"{number[verdict]} {verdict.value}" for verdict in ItemVerdict]
     return f"{len(results)} items: {', '.join(parts)}"
 
 
@@ -160,8 +160,8 @@ def junit(results: Sequence[Result], name: str) -> bytes:
         "testsuite",
         name=name,
         tests=str(len(results)),
-        failures=str(number[Verdict.FAILED]),
-        skipped=str(number[Verdict.DEVIATES] + number[Verdict.SKIPPED]),
+        failures=str(number[ItemVerdict.FAILED]),
+        skipped=str(number[ItemVerdict.DEVIATES] + number[ItemVerdict.SKIPPED]),
         errors="0",
         time=f"{sum(result.seconds for result in results):.3f}",
     )
@@ -175,13 +175,13 @@ def junit(results: Sequence[Result], name: str) -> bytes:
         )
         detail = f"{result.item.stimulus}: expected {result.item.expected}; {result.answer}"
         match result.verdict:
-            case Verdict.FAILED:
+            case ItemVerdict.FAILED:
                 ET.SubElement(case, "failure", message=detail)
-            case Verdict.DEVIATES:
+            case ItemVerdict.DEVIATES:
                 ET.SubElement(case, "skipped", message=f"{detail}; {result.reason}")
-            case Verdict.SKIPPED:
+            case ItemVerdict.SKIPPED:
                 ET.SubElement(case, "skipped", message=result.answer)
-            case Verdict.PASSED:
+            case ItemVerdict.PASSED:
                 ET.SubElement(case, "system-out").text = detail
     ET.indent(suite)
     return bytes(ET.tostring(suite, encoding="utf-8", xml_declaration=True)) + b"\n"

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.desk.conformance.items import Skipped, item, require, require_abort
 from kontronik_can_gw.desk.conformance.nmt_items import HEARTBEAT_TIME, require_heartbeat
-from kontronik_can_gw.desk.conformance.slave import Abort, Slave, multiplexer, unless_aborted
+from kontronik_can_gw.desk.conformance.slave import SdoAbort, Slave, multiplexer, unless_aborted
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ODVariable
@@ -251,7 +251,7 @@ def sdo_block_upload(slave: Slave) -> str:
     begin = slave.request(b"\xa4" + multiplexer(index, sub) + b"\x7f")
     try:
         unless_aborted(begin)
-    except Abort as abort:
+    except SdoAbort as abort:
         if abort.code in (UNKNOWN_COMMAND, UNSUPPORTED_ACCESS):
             raise Skipped(f"no block transfer ({abort})") from None
         raise

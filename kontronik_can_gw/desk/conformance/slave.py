@@ -24,7 +24,7 @@ DEVICE_TYPE = 0x1000
 """An object that every slave has and that can be read."""
 
 
-class Frame(NamedTuple):
+class ReceivedFrame(NamedTuple):
     """A frame that was received."""
 
     can_id: int
@@ -37,7 +37,7 @@ class NoAnswer(Exception):
     """The slave did not answer a request within the time limit."""
 
 
-class Abort(Exception):
+class SdoAbort(Exception):
     """The slave aborted an SDO transfer."""
 
     def __init__(self, code: int) -> None:
@@ -83,7 +83,7 @@ class Slave:
         )
         self.bus.send(message, timeout=self.limit_s)
 
-    def receive(self, until_s: float) -> Frame | None:
+    def receive(self, until_s: float) -> ReceivedFrame | None:
         """Return the next frame. None if there is none until this time of ``time.monotonic``.
 
         A time in the past returns a frame that has arrived already.
@@ -94,23 +94,25 @@ class Slave:
                 return None
             is_data = not (message.is_error_frame or message.is_remote_frame)
             if is_data and not message.is_extended_id:
-                frame = Frame(message.arbitration_id, bytes(message.data), time.monotonic())
+                frame = ReceivedFrame(message.arbitration_id, bytes(message.data), time.monotonic())
                 self._note_other_node(frame)
                 return frame
 
-    def waiting_frames(self) -> list[Frame]:
+    def waiting_frames(self) -> list[ReceivedFrame]:
         """Return the frames that have arrived."""
         frames = []
         while (frame := self.receive(0)) is not None:
             frames.append(frame)
         return frames
 
-    def _note_other_node(self, frame: Frame) -> None:
+    def _note_other_node(self, frame: ReceivedFrame) -> None:
         node_id = frame.can_id - _HEARTBEAT
         if 0 < node_id < 0x80 and node_id != self.node_id:
             self.other_nodes.add(node_id)
 
-    def wait_for(self, condition: Callable[[Frame], bool], limit_s: float | None = None) -> Frame:
+    def wait_for(
+        self, condition: Callable[[ReceivedFrame], bool], limit_s: float | None = None
+    ) -> ReceivedFrame:
         """Return the first frame that meets a condition. Raises NoAnswer after the limit."""
         until_s = time.monotonic() + (self.limit_s if limit_s is None else limit_s)
         while (frame := self.receive(until_s)) is not None:
@@ -118,7 +120,7 @@ class Slave:
                 return frame
         raise NoAnswer
 
-    def frames_during(self, seconds: float) -> list[Frame]:
+    def frames_during(self, seconds: float) -> list[ReceivedFrame]:
         """Return all frames that arrive within this time."""
         frames = []
         until_s = time.monotonic() + seconds
@@ -126,7 +128,7 @@ class Slave:
             frames.append(frame)
         return frames
 
-    def frames_until_answer(self) -> list[Frame]:
+    def frames_until_answer(self) -> list[ReceivedFrame]:
         """Read the device type and return all frames that arrived before the answer.
 
         Raises NoAnswer after the time limit.
@@ -141,7 +143,7 @@ class Slave:
             frames.append(frame)
         raise NoAnswer
 
-    def answers_until_answer(self) -> list[Frame]:
+    def answers_until_answer(self) -> list[ReceivedFrame]:
         """Read the device type and return the SDO answers that arrived before its answer.
 
         Raises NoAnswer after the time limit.
@@ -161,14 +163,14 @@ class Slave:
     def sync(self) -> None:
         self.send(_SYNC, b"")
 
-    def restart(self, command: int) -> list[Frame]:
+    def restart(self, command: int) -> list[ReceivedFrame]:
         """Reset the slave and enter PRE-OPERATIONAL. Return the frames up to its first answer.
 
         Raises NoAnswer if the slave does not answer after the reset.
         """
         self.waiting_frames()
         self.nmt(command)
-        frames: list[Frame] = []
+        frames: list[ReceivedFrame] = []
         until_s = time.monotonic() + self.limit_s
         while self.sends_boot_up:
             frame = self.receive(until_s)
@@ -199,11 +201,11 @@ class Slave:
         """Send an SDO request without waiting for an answer."""
         self.send(_SDO_REQUEST + self.node_id, data.ljust(8, b"\0"))
 
-    def is_answer(self, frame: Frame) -> bool:
+    def is_answer(self, frame: ReceivedFrame) -> bool:
         return frame.can_id == _SDO_ANSWER + self.node_id
 
     def read(self, index: int, sub: int = 0) -> bytes:
-        """Return the data of an object, by an expedited or a segmented upload. Raises Abort."""
+        """Return the data of an object, by an expedited or a segmented upload. Raises SdoAbort."""
         answer = unless_aborted(self.request(b"\x40" + multiplexer(index, sub)))
         if answer[0] & 0xE0 != 0x40 or answer[1:4] != multiplexer(index, sub):
             raise UnexpectedAnswer(answer)
@@ -222,18 +224,18 @@ class Slave:
                 return data
 
     def number(self, index: int, sub: int = 0) -> int:
-        """Return the value of an object as an unsigned number. Raises Abort."""
+        """Return the value of an object as an unsigned number. Raises SdoAbort."""
         return int.from_bytes(self.read(index, sub), "little")
 
     def write(self, index: int, sub: int, data: bytes) -> None:
-        """Write 1 to 4 bytes by an expedited download. Raises Abort."""
+        """Write 1 to 4 bytes by an expedited download. Raises SdoAbort."""
         command = bytes((0x23 | 4 - len(data) << 2,))
         answer = unless_aborted(self.request(command + multiplexer(index, sub) + data))
         if answer[:4] != b"\x60" + multiplexer(index, sub):
             raise UnexpectedAnswer(answer)
 
     def write_number(self, index: int, sub: int, value: int) -> None:
-        """Write a value in the size of the object's data type. Raises Abort."""
+        """Write a value in the size of the object's data type. Raises SdoAbort."""
         variable = self.variable(index, sub)
         assert variable is not None
         size = len(variable) // 8
@@ -283,7 +285,7 @@ def multiplexer(index: int, sub: int) -> bytes:
 
 
 def unless_aborted(answer: bytes) -> bytes:
-    """Return an SDO answer. Raises Abort if it aborts the transfer."""
+    """Return an SDO answer. Raises SdoAbort if it aborts the transfer."""
     if answer[0] == ABORT:
-        raise Abort(int.from_bytes(answer[4:8], "little"))
+        raise SdoAbort(int.from_bytes(answer[4:8], "little"))
     return answer
