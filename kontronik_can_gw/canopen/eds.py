@@ -356,14 +356,7 @@ def _entry(section: Section, index: int, sub: int) -> EdsEntry:
     high = _limit(section, "HighLimit", data_type)
     default, relative = _default(section, data_type)
     if isinstance(default, int) and not relative:
-        if low is not None and default < low:
-            raise ValueError(
-                f"{section.quoted('DefaultValue')}: below {section.quoted('LowLimit')}."
-            )
-        if high is not None and default > high:
-            raise ValueError(
-                f"{section.quoted('DefaultValue')}: above {section.quoted('HighLimit')}."
-            )
+        _check_limits(section, default, low, high)
     return EdsEntry(
         index=index,
         sub=sub,
@@ -376,6 +369,14 @@ def _entry(section: Section, index: int, sub: int) -> EdsEntry:
         default=default,
         relative=relative,
     )
+
+
+def _check_limits(section: Section, default: int, low: int | None, high: int | None) -> None:
+    """Raise ValueError for a default beyond its limits."""
+    if low is not None and default < low:
+        raise ValueError(f"{section.quoted('DefaultValue')}: below {section.quoted('LowLimit')}.")
+    if high is not None and default > high:
+        raise ValueError(f"{section.quoted('DefaultValue')}: above {section.quoted('HighLimit')}.")
 
 
 def _limit(section: Section, key: str, data_type: int) -> int | None:
