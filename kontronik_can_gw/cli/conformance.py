@@ -8,6 +8,7 @@ from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.output import check_output, write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.conformance.bench import slave_on_bus
+from kontronik_can_gw.desk.conformance.eds_file import read_eds
 from kontronik_can_gw.desk.conformance.items import Item
 from kontronik_can_gw.desk.conformance.run import (
     GATEWAY_DEVIATIONS,
@@ -57,7 +58,8 @@ It resets the slave many times, changes its node-ID and stores parameters. Use
 it on a bench, with one slave on the bus, never in a running vehicle.
 
 The verdict of an item is passed, failed, deviates (it failed, and --deviations
-gives a reason), or not supported (an optional service that the slave lacks).
+gives a reason), or not supported (an optional service that the slave lacks, or
+an item that requires silence of a service that did not work).
 The file of deviations has a line for each item:
 
   od-vendor-id-is-assigned = "prototype without a vendor-ID"
@@ -83,20 +85,23 @@ def main(args: argparse.Namespace) -> int:
     items = chosen_items(args.only)
     reasons = args.deviations or (None if args.eds else GATEWAY_DEVIATIONS)
     deviations = read_deviations(None if reasons is None else Path(reasons))
-    eds = Path(args.eds) if args.eds else Path(str(shipped("eds/kontronik_esc.eds")))
-    for output in (args.output, args.junit):
-        if output is not None:
-            check_output(output, [eds], force=args.force)
+    path = Path(args.eds) if args.eds else Path(str(shipped("eds/kontronik_esc.eds")))
+    for output in filter(None, (args.output, args.junit)):
+        check_output(output, [path], force=args.force)
+    eds = read_eds(path, args.node)
     with slave_on_bus(args.interface, args.channel, args.node, eds, args.limit) as slave:
         results = _results(slave, items, deviations)
-    text = _report(args, eds, results)
+    _write_reports(args, path, results)
+    say(counts(results), args.command)
+    return 1 if any(result.verdict is ItemVerdict.FAILED for result in results) else 0
+
+
+def _write_reports(args: argparse.Namespace, eds: Path, results: list[Result]) -> None:
     if args.output is not None:
-        write_output(args.output, text, force=args.force)
+        write_output(args.output, _report(args, eds, results), force=args.force)
     if args.junit is not None:
         xml = junit(results, f"CANopen conformance of {eds.name}")
         write_output(args.junit, xml.decode("utf-8"), force=args.force)
-    say(counts(results), args.command)
-    return 1 if any(result.verdict is ItemVerdict.FAILED for result in results) else 0
 
 
 def _results(slave: Slave, items: list[Item], deviations: dict[str, str]) -> list[Result]:

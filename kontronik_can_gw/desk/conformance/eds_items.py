@@ -1,47 +1,32 @@
 """The EDS of the slave: CiA 306."""
 
-import configparser
-import re
-
+from kontronik_can_gw.canopen.eds import OBJECT
+from kontronik_can_gw.desk.conformance.eds_file import LISTS, section_of
 from kontronik_can_gw.desk.conformance.items import item, require
 from kontronik_can_gw.desk.conformance.slave import Slave
 
-_LISTS = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
-_SECTIONS = ("FileInfo", "DeviceInfo", *_LISTS)
+_SECTIONS = ("FileInfo", "DeviceInfo", *LISTS)
 _MANDATORY = (0x1000, 0x1001, 0x1018)
 _ACCESS_TYPES = ("ro", "wo", "rw", "rwr", "rww", "const")
 _RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 _LONGEST_NAME = 241
 
 
-def sections_of(slave: Slave) -> configparser.ConfigParser:
-    sections = configparser.ConfigParser(interpolation=None, strict=False)
-    sections.read_string(slave.eds_text)
-    return sections
-
-
-def number_of(text: str) -> int:
-    return int(text.partition(";")[0].strip() or "0", 0)
-
-
 @item("CiA 306 (test tool EDS checker 01)", "sections of the EDS", ", ".join(_SECTIONS))
 def eds_sections(slave: Slave) -> str:
-    sections = sections_of(slave)
-    names = {name.upper() for name in sections.sections()}
-    missing = [name for name in _SECTIONS if name.upper() not in names]
+    missing = [name for name in _SECTIONS if name.lower() not in slave.eds]
     required = [name for name in missing if name not in ("OptionalObjects", "ManufacturerObjects")]
     require(not required, f"missing: {', '.join(required)}")
     return f"{len(_SECTIONS) - len(missing)} of {len(_SECTIONS)}"
 
 
 def _listed(slave: Slave) -> dict[str, list[int]]:
-    sections = sections_of(slave)
+    """Return the indices in each list of objects."""
     found = {}
-    for name in _LISTS:
-        if sections.has_section(name):
-            rows = dict(sections[name])
-            rows.pop("supportedobjects", None)
-            found[name] = [number_of(value) for value in rows.values()]
+    for name in LISTS:
+        section = section_of(slave.eds, name)
+        keys = section.keys.keys() - {"supportedobjects"}
+        found[name] = sorted(section.number(key) for key in keys)
     return found
 
 
@@ -51,17 +36,15 @@ def _listed(slave: Slave) -> dict[str, list[int]]:
     "SupportedObjects is their number, each object is in one list and has a section",
 )
 def eds_lists_of_objects(slave: Slave) -> str:
-    sections = sections_of(slave)
-    upper = {name.upper() for name in sections.sections()}
     total: list[int] = []
     for name, indices in _listed(slave).items():
-        stated = number_of(sections[name].get("SupportedObjects", "0"))
+        stated = section_of(slave.eds, name).number("SupportedObjects")
         require(stated == len(indices), f"{name}: SupportedObjects={stated}, {len(indices)} listed")
         total += indices
     require(len(set(total)) == len(total), "an object is in two lists")
-    without = [index for index in total if f"{index:04X}" not in upper]
+    without = [index for index in total if f"{index:04x}" not in slave.eds]
     require(not without, f"no section: {', '.join(f'{index:04X}h' for index in without[:4])}")
-    written = {int(name, 16) for name in upper if re.fullmatch(r"[0-9A-F]{4}", name)}
+    written = {int(match[1], 16) for match in map(OBJECT.match, slave.eds) if match}
     unlisted = sorted(written - set(total))
     require(not unlisted, f"in no list: {', '.join(f'{index:04X}h' for index in unlisted[:4])}")
     return f"{len(total)} objects"
@@ -80,30 +63,19 @@ def eds_mandatory_objects(slave: Slave) -> str:
 @item(
     "CiA 306",
     "keys of each object",
-    "ParameterName of at most 241 characters, DataType and AccessType of each variable",
+    "ParameterName of at most 241 characters, AccessType of each variable",
 )
 def eds_keys_of_objects(slave: Slave) -> str:
-    sections = sections_of(slave)
+    sections = [section for name, section in slave.eds.items() if OBJECT.match(name)]
     wrong = []
-    count = 0
-    for name in sections.sections():
-        if not re.fullmatch(r"[0-9A-Fa-f]{4}(sub[0-9A-Fa-f]{1,2})?", name):
-            continue
-        count += 1
-        keys = sections[name]
-        title = keys.get("ParameterName", "")
-        if not 0 < len(title) <= _LONGEST_NAME:
-            wrong.append(f"[{name}] ParameterName")
-        object_type = number_of(keys.get("ObjectType", "7"))
-        if object_type in (8, 9):
-            continue
-        if "DataType" not in keys:
-            wrong.append(f"[{name}] DataType")
-        access = keys.get("AccessType", "").split(";")[0].strip().lower()
-        if access not in _ACCESS_TYPES:
-            wrong.append(f"[{name}] AccessType={access}")
+    for section in sections:
+        if not 0 < len(section.get("ParameterName")) <= _LONGEST_NAME:
+            wrong.append(f"[{section.name}] ParameterName")
+        is_variable = section.number("ObjectType", 7) not in (8, 9)
+        if is_variable and section.get("AccessType").lower() not in _ACCESS_TYPES:
+            wrong.append(f"[{section.name}] {section.quoted('AccessType')}")
     require(not wrong, "; ".join(wrong[:4]))
-    return f"{count} sections"
+    return f"{len(sections)} sections"
 
 
 @item(
@@ -112,10 +84,10 @@ def eds_keys_of_objects(slave: Slave) -> str:
     "the numbers of 18xxh and 14xxh objects",
 )
 def eds_numbers_of_pdos(slave: Slave) -> str:
-    keys = sections_of(slave)["DeviceInfo"]
+    info = section_of(slave.eds, "DeviceInfo")
     answers = []
     for name, begin in (("NrOfTXPDO", 0x1800), ("NrOfRXPDO", 0x1400)):
-        stated = number_of(keys.get(name, "0"))
+        stated = info.number(name)
         found = sum(begin <= index < begin + 0x200 for index in slave.dictionary)
         require(stated == found, f"{name}={stated}, and {found} objects")
         answers.append(f"{name}={stated}")
@@ -124,7 +96,7 @@ def eds_numbers_of_pdos(slave: Slave) -> str:
 
 @item("CiA 306", "BaudRate entries of [DeviceInfo]", "at least one bit rate is supported")
 def eds_bit_rates(slave: Slave) -> str:
-    keys = sections_of(slave)["DeviceInfo"]
-    rates = [rate for rate in _RATES if number_of(keys.get(f"BaudRate_{rate}", "0"))]
+    info = section_of(slave.eds, "DeviceInfo")
+    rates = [rate for rate in _RATES if info.number(f"BaudRate_{rate}")]
     require(bool(rates), "none")
     return f"{', '.join(map(str, rates))} kbit/s"

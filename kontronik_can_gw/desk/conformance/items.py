@@ -30,18 +30,22 @@ class Item(NamedTuple):
     stimulus: str
     expected: str
     run: Procedure
+    needs: str
+    """Item that shows that the slave has the service whose silence this item requires, or ""."""
 
 
 ITEMS: list[Item] = []
 """All items. The modules of the items add to it when they are imported."""
 
 
-def item(clause: str, stimulus: str, expected: str) -> Callable[[Procedure], Procedure]:
+def item(
+    clause: str, stimulus: str, expected: str, *, needs: str = ""
+) -> Callable[[Procedure], Procedure]:
     """Add a function to the items. Its name becomes the name of the item."""
 
     def add(procedure: Procedure) -> Procedure:
         name = procedure.__name__.replace("_", "-")
-        ITEMS.append(Item(name, clause, stimulus, expected, procedure))
+        ITEMS.append(Item(name, clause, stimulus, expected, procedure, needs))
         return procedure
 
     return add

@@ -1,9 +1,9 @@
 """Layer setting services: CiA 305."""
 
-from kontronik_can_gw.desk.conformance.eds_items import number_of, sections_of
+from kontronik_can_gw.desk.conformance.eds_file import section_of
 from kontronik_can_gw.desk.conformance.items import Skipped, Wrong, item, require
 from kontronik_can_gw.desk.conformance.nmt_items import RESET_COMMUNICATION, RESET_NODE
-from kontronik_can_gw.desk.conformance.slave import NoAnswer, ReceivedFrame, Slave
+from kontronik_can_gw.desk.conformance.slave import RESET_S, NoAnswer, ReceivedFrame, Slave
 
 _TO_SLAVE = 0x7E5
 _FROM_SLAVE = 0x7E4
@@ -25,7 +25,7 @@ _UNCONFIGURED = 0xFF
 
 def _begin(slave: Slave) -> None:
     """Raise Skipped if the slave has no LSS, or if LSS would also reach other slaves."""
-    if not number_of(sections_of(slave)["DeviceInfo"].get("LSS_Supported", "0")):
+    if not section_of(slave.eds, "DeviceInfo").number("LSS_Supported"):
         raise Skipped("LSS_Supported=0 in the EDS")
     if slave.other_nodes:
         others = ", ".join(map(str, sorted(slave.other_nodes)))
@@ -61,7 +61,7 @@ def _bytes(value: int) -> bytes:
     return value.to_bytes(4, "little")
 
 
-@item("CiA 305", "switch state global to configuration", "no answer")
+@item("CiA 305", "switch state global to configuration", "no answer", needs="lss-inquire-node-id")
 def lss_switch_global(slave: Slave) -> str:
     _begin(slave)
     _switch(slave, _CONFIGURATION)
@@ -95,7 +95,7 @@ def lss_inquire_node_id(slave: Slave) -> str:
     return str(answer[1])
 
 
-@item("CiA 305", "inquire node-ID in state waiting", "no answer")
+@item("CiA 305", "inquire node-ID in state waiting", "no answer", needs="lss-inquire-node-id")
 def lss_silent_while_waiting(slave: Slave) -> str:
     _begin(slave)
     _send(slave, _INQUIRE_NODE_ID)
@@ -119,7 +119,12 @@ def lss_switch_selective(slave: Slave) -> str:
     return "44h"
 
 
-@item("CiA 305", "switch state selective with another serial number", "no answer")
+@item(
+    "CiA 305",
+    "switch state selective with another serial number",
+    "no answer",
+    needs="lss-switch-selective",
+)
 def lss_switch_selective_of_another_slave(slave: Slave) -> str:
     _begin(slave)
     identity = _identity(slave)
@@ -218,8 +223,7 @@ def lss_fastscan(slave: Slave) -> str:
 
 def _scan(slave: Slave) -> list[int]:
     """Return the identity that fastscan finds, bit by bit. The slave is in configuration then."""
-    _send(slave, _FASTSCAN, bytes(4) + b"\x80")
-    require(_answer(slave).data[0] == _IDENTIFIED, "no slave answers to fastscan")
+    _begin_scan(slave)
     found = []
     for part in range(4):
         value = 0
@@ -234,15 +238,30 @@ def _scan(slave: Slave) -> list[int]:
     return found
 
 
+def _begin_scan(slave: Slave) -> None:
+    """Send the first step of fastscan until it is answered.
+
+    An unconfigured slave sends no boot-up message, so the end of its reset is not visible.
+    """
+    slave.frames_during(RESET_S)
+    until_s = slave.clock() + slave.limit_s
+    while slave.clock() < until_s:
+        _send(slave, _FASTSCAN, bytes(4) + b"\x80")
+        if _was_answered(slave):
+            return
+    raise Wrong("no slave answers to fastscan")
+
+
 def _was_answered(slave: Slave) -> bool:
     """Return True if the slave answers to a step of fastscan.
 
     An unconfigured slave answers no SDO request, so the answer can only be waited for.
     """
     try:
-        slave.wait_for(lambda frame: frame.can_id == _FROM_SLAVE, slave.limit_s / 10)
+        answer = slave.wait_for(lambda frame: frame.can_id == _FROM_SLAVE, slave.limit_s / 10)
     except NoAnswer:
         return False
+    require(answer.data[0] == _IDENTIFIED, f"answer {answer.data.hex(' ').upper()}")
     return True
 
 

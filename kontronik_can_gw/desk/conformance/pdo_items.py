@@ -1,6 +1,7 @@
 """TPDOs and SYNC: CiA 301, 7.2.2 and 7.2.5."""
 
 from functools import partial
+from typing import TYPE_CHECKING
 
 from kontronik_can_gw.desk.conformance.items import Skipped, item, require, require_abort
 from kontronik_can_gw.desk.conformance.nmt_items import ENTER_PRE_OPERATIONAL, START, STOP
@@ -9,9 +10,14 @@ from kontronik_can_gw.desk.conformance.sdo_items import (
     VALUE_RANGE,
     VALUE_TOO_HIGH,
     VALUE_TOO_LOW,
+    first,
+    is_number,
     is_writable,
 )
 from kontronik_can_gw.desk.conformance.slave import ReceivedFrame, SdoAbort, Slave
+
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ODVariable
 
 _COMMUNICATION = 0x1800
 _MAPPING = 0x1A00
@@ -22,6 +28,8 @@ _CANNOT_BE_MAPPED = 0x06040041
 _TOO_LONG = 0x06040042
 _RESERVED_TYPES = (241, 245, 251)
 _OTHER_SYNC = 0x0FE
+_POSITIVE = "pdo-each-sync"
+"""The item that shows that the slave sends its first TPDO."""
 _LIMITS = (VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW)
 
 
@@ -32,23 +40,43 @@ class FirstTpdo:
     """
 
     def __init__(self, slave: Slave) -> None:
-        if not slave.has(_COMMUNICATION, 1):
-            raise Skipped("the slave has no TPDO")
+        for sub in (1, 2):
+            variable = slave.variable(_COMMUNICATION, sub)
+            if variable is None:
+                raise Skipped("the slave has no TPDO")
+            if not is_writable(variable):
+                raise Skipped(f"1800h:{sub:02X} cannot be written")
         self.slave = slave
         self.cob_id = 0x180 + slave.node_id
         for index in slave.dictionary:
-            if _COMMUNICATION < index < _MAPPING:
-                slave.write_number(index, 1, _INVALID | _NO_RTR | 0x180 + slave.node_id)
+            if not _COMMUNICATION < index < _MAPPING:
+                continue
+            other = slave.variable(index, 1)
+            if other is not None and is_writable(other):
+                slave.write_number(index, 1, _INVALID | _NO_RTR | self.cob_id)
         self.disable()
 
     def disable(self) -> None:
         self.slave.write_number(_COMMUNICATION, 1, _INVALID | _NO_RTR | self.cob_id)
 
     def enable(self, transmission_type: int) -> None:
+        """Enable the TPDO. Without a default mapping, an object is mapped first."""
+        if self.slave.number(_MAPPING, 0) == 0:
+            self.map_object()
         self.slave.write_number(_COMMUNICATION, 2, transmission_type)
         if self.slave.has(_COMMUNICATION, 5):
             self.slave.write_number(_COMMUNICATION, 5, 0)
         self.slave.write_number(_COMMUNICATION, 1, _NO_RTR | self.cob_id)
+
+    def map_object(self) -> "ODVariable":
+        """Map only the first object of the EDS that can be mapped, and return it."""
+        self.require_writable_mapping()
+        target = first(self.slave, _can_be_mapped, "object that can be mapped")
+        self.slave.write_number(_MAPPING, 0, 0)
+        entry = target.index << 16 | target.subindex << 8 | len(target)
+        self.slave.write_number(_MAPPING, 1, entry)
+        self.slave.write_number(_MAPPING, 0, 1)
+        return target
 
     def seen_in(self, frames: list[ReceivedFrame]) -> list[ReceivedFrame]:
         return [frame for frame in frames if frame.can_id == self.cob_id]
@@ -73,6 +101,12 @@ class FirstTpdo:
         variable = self.slave.variable(_MAPPING, 0)
         if variable is None or not is_writable(variable):
             raise Skipped("the mapping of the first TPDO cannot be changed")
+
+
+def _can_be_mapped(variable: "ODVariable") -> bool:
+    """Return True if a TPDO may have an entry of the EDS, and the entry has whole bytes."""
+    is_sent = variable.access_type not in ("wo", "rww")
+    return variable.pdo_mappable and is_sent and is_number(variable)
 
 
 @item("CiA 301, 7.2.2", "type 1 and 10 SYNCs in OPERATIONAL", "10 TPDOs, as long as the mapping")
@@ -102,6 +136,7 @@ def pdo_each_third_sync(slave: Slave) -> str:
     "CiA 301, 7.2.2 (test tool PDO 07)",
     "type 0 (acyclic) and 5 SYNCs in OPERATIONAL",
     "no TPDO without a SYNC, and at most one for each SYNC",
+    needs=_POSITIVE,
 )
 def pdo_acyclic(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
@@ -114,7 +149,7 @@ def pdo_acyclic(slave: Slave) -> str:
     return f"{count} TPDOs after 5 SYNCs; only a changed value needs one"
 
 
-@item("CiA 301, 7.2.2", "TPDO disabled by bit 31, and SYNCs", "no TPDO")
+@item("CiA 301, 7.2.2", "TPDO disabled by bit 31, and SYNCs", "no TPDO", needs=_POSITIVE)
 def pdo_disabled(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.enable(1)
@@ -125,7 +160,7 @@ def pdo_disabled(slave: Slave) -> str:
     return "no TPDO"
 
 
-@item("CiA 301, 7.3.2.2", "type 1 and SYNCs in PRE-OPERATIONAL", "no TPDO")
+@item("CiA 301, 7.3.2.2", "type 1 and SYNCs in PRE-OPERATIONAL", "no TPDO", needs=_POSITIVE)
 def pdo_none_in_pre_operational(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.enable(1)
@@ -139,6 +174,7 @@ def pdo_none_in_pre_operational(slave: Slave) -> str:
     "CiA 301, 7.3.2.2 (test tool State 04)",
     "type 1, NMT stop, and SYNCs while STOPPED",
     "no TPDO",
+    needs=_POSITIVE,
 )
 def pdo_none_while_stopped(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
@@ -223,6 +259,25 @@ def pdo_remote_types(slave: Slave) -> str:
     return f"252: {answers[0]}, 253: {answers[1]}"
 
 
+@item(
+    "CiA 301, 1800h:3",
+    "type 254 with an event timer of 20 ms and an inhibit time of 100 ms",
+    "at most 12 TPDOs a second",
+    needs="pdo-event-timer",
+)
+def pdo_inhibit_time(slave: Slave) -> str:
+    tpdo = FirstTpdo(slave)
+    if not (slave.has(_COMMUNICATION, 3) and slave.has(_COMMUNICATION, 5)):
+        raise Skipped("the EDS does not have 1800h:3 and 1800h:5")
+    slave.write_number(_COMMUNICATION, 3, 1000)
+    tpdo.enable(254)
+    slave.write_number(_COMMUNICATION, 5, 20)
+    slave.nmt(START)
+    count = len(tpdo.seen_in(slave.frames_during(1.0)))
+    require(count <= 12, f"{count} TPDOs")
+    return f"{count} TPDOs in a second"
+
+
 @item("CiA 301, 1800h:3", "new inhibit time while the TPDO is valid", "abort")
 def pdo_inhibit_time_while_valid(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
@@ -237,7 +292,7 @@ def pdo_mapping_while_active(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.require_writable_mapping()
     if slave.number(_MAPPING, 0) == 0:
-        raise Skipped("the first TPDO has no mapping")
+        tpdo.map_object()
     before = slave.number(_MAPPING, 1)
     answer = require_abort(lambda: slave.write_number(_MAPPING, 1, before))
     require(slave.number(_MAPPING, 1) == before, "the mapping has changed")
@@ -251,14 +306,7 @@ def pdo_mapping_while_active(slave: Slave) -> str:
 )
 def pdo_mapping_procedure(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
-    tpdo.require_writable_mapping()
-    target = next((v for v in slave.variables() if v.pdo_mappable and v.access_type != "wo"), None)
-    if target is None:
-        raise Skipped("the EDS has no object that can be mapped")
-    slave.write_number(_MAPPING, 0, 0)
-    entry = target.index << 16 | target.subindex << 8 | len(target)
-    slave.write_number(_MAPPING, 1, entry)
-    slave.write_number(_MAPPING, 0, 1)
+    target = tpdo.map_object()
     tpdo.enable(1)
     slave.nmt(START)
     slave.sync()
@@ -295,10 +343,10 @@ def pdo_mapping_of_an_unmappable_object(slave: Slave) -> str:
 def pdo_mapping_too_long(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.require_writable_mapping()
-    wide = [v for v in slave.variables() if v.pdo_mappable and len(v) == 32]
-    if not wide:
-        raise Skipped("the EDS has no object of 32 bits that can be mapped")
-    entry = wide[0].index << 16 | wide[0].subindex << 8 | 32
+    wide = first(
+        slave, lambda v: _can_be_mapped(v) and len(v) == 32, "object of 32 bits that can be mapped"
+    )
+    entry = wide.index << 16 | wide.subindex << 8 | 32
     if not slave.has(_MAPPING, 3):
         raise Skipped("the mapping has fewer than three entries")
     slave.write_number(_MAPPING, 0, 0)

@@ -1,6 +1,5 @@
 """Runs the items of a conformance test, and writes the results as a table and as JUnit."""
 
-import time
 import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -101,28 +100,51 @@ def chosen_items(words: Sequence[str]) -> list[Item]:
 
 
 def run(slave: Slave, items: Sequence[Item], deviations: Mapping[str, str]) -> Iterator[Result]:
-    """Run the items one after the other. Before each one the slave is reset."""
+    """Run the items one after the other. Before each one the slave is reset.
+
+    An item that requires silence is not supported instead of passed if the item that it needs did
+    not pass, because a slave without the service is silent, too.
+    """
+    named = {item.name: item for item in all_items()}
+    done: dict[str, Result] = {}
+
+    def result_of(item: Item) -> Result:
+        if item.name in done:
+            return done[item.name]
+        result = _run_item(slave, item, deviations.get(item.name, ""))
+        is_doubtful = bool(item.needs) and result.verdict is ItemVerdict.PASSED
+        if is_doubtful and result_of(named[item.needs]).verdict is not ItemVerdict.PASSED:
+            answer = f"{result.answer}, but {item.needs} did not pass either"
+            result = result._replace(answer=answer, verdict=ItemVerdict.SKIPPED)
+        done[item.name] = result
+        return result
+
     for item in items:
-        begun = time.monotonic()
-        verdict = ItemVerdict.PASSED
-        try:
-            if item.run.__module__ != eds_items.__name__:
-                slave.restart(RESET_NODE)
-            answer = item.run(slave)
-        except Skipped as skipped:
-            answer = str(skipped)
-            verdict = ItemVerdict.SKIPPED
-        except (Wrong, SdoAbort, UnexpectedAnswer) as error:
-            answer = str(error)
-            verdict = ItemVerdict.FAILED
-        except NoAnswer:
-            answer = f"no answer within {slave.limit_s:g} s"
-            verdict = ItemVerdict.FAILED
+        yield result_of(item)
+
+
+def _run_item(slave: Slave, item: Item, reason: str) -> Result:
+    """Run one item. ``reason`` explains a deliberate deviation."""
+    begun_s = slave.clock()
+    verdict = ItemVerdict.PASSED
+    try:
+        if item.run.__module__ != eds_items.__name__:
+            slave.restart(RESET_NODE)
+        answer = item.run(slave)
+    except Skipped as skipped:
+        answer = str(skipped)
+        verdict = ItemVerdict.SKIPPED
+    except (Wrong, SdoAbort, UnexpectedAnswer) as error:
+        answer = str(error)
+        verdict = ItemVerdict.FAILED
+    except NoAnswer:
+        answer = f"no answer within {slave.limit_s:g} s"
+        verdict = ItemVerdict.FAILED
+    if verdict is ItemVerdict.FAILED and reason:
+        verdict = ItemVerdict.DEVIATES
+    else:
         reason = ""
-        if verdict is ItemVerdict.FAILED and item.name in deviations:
-            verdict = ItemVerdict.DEVIATES
-            reason = deviations[item.name]
-        yield Result(item, answer, verdict, reason, time.monotonic() - begun)
+    return Result(item, answer, verdict, reason, slave.clock() - begun_s)
 
 
 def counts(results: Sequence[Result]) -> str:

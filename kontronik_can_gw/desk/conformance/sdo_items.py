@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.desk.conformance.items import Skipped, item, require, require_abort
 from kontronik_can_gw.desk.conformance.nmt_items import HEARTBEAT_TIME, require_heartbeat
-from kontronik_can_gw.desk.conformance.slave import SdoAbort, Slave, multiplexer, unless_aborted
+from kontronik_can_gw.desk.conformance.slave import SdoAbort, Slave, multiplexer
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ODVariable
@@ -52,7 +52,7 @@ def encoded(variable: "ODVariable", value: int) -> bytes:
 
 
 def first(slave: Slave, condition: Callable[["ODVariable"], bool], what: str) -> "ODVariable":
-    """Return the first entry that meets a condition. Raises Skipped if there is none."""
+    """Return the first entry that meets a condition. Raises Skipped without such an entry."""
     for variable in slave.variables():
         if condition(variable):
             return variable
@@ -61,7 +61,7 @@ def first(slave: Slave, condition: Callable[["ODVariable"], bool], what: str) ->
 
 @item("CiA 301, 7.5.2, 1000h", "upload of 1000h", "expedited, 4 bytes, the value of the EDS")
 def sdo_device_type(slave: Slave) -> str:
-    answer = unless_aborted(slave.request(b"\x40" + multiplexer(0x1000, 0)))
+    answer = slave.ask(b"\x40" + multiplexer(0x1000, 0), multiplexer(0x1000, 0))
     require(answer[0] == 0x43, f"command specifier {answer[0]:02X}h")
     value = int.from_bytes(answer[4:], "little")
     variable = slave.variable(0x1000)
@@ -174,30 +174,31 @@ def sdo_written_value_is_read_back(slave: Slave) -> str:
 
 @item("CiA 301, 7.2.4.3.17", "unknown command specifier 7", "abort 05040001h")
 def sdo_unknown_command(slave: Slave) -> str:
-    return require_abort(lambda: unless_aborted(slave.request(b"\xe0")), UNKNOWN_COMMAND)
+    return require_abort(lambda: slave.ask(b"\xe0", None), UNKNOWN_COMMAND)
 
 
 @item("CiA 301, 7.2.4.3.17", "segment request without a transfer", "abort 05040001h")
 def sdo_segment_without_a_transfer(slave: Slave) -> str:
-    return require_abort(lambda: unless_aborted(slave.request(b"\x60")), UNKNOWN_COMMAND)
+    return require_abort(lambda: slave.ask(b"\x60", None), UNKNOWN_COMMAND)
 
 
-def _segmented(slave: Slave) -> tuple[int, int]:
-    """Return index and sub-index of an object with more than four bytes. Raises Skipped."""
+def _segmented(slave: Slave) -> int:
+    """Return the index of a variable with more than seven bytes. Raises Skipped."""
     for index in (_DEVICE_NAME, 0x1009, 0x100A, _EDS_OBJECT):
         if slave.has(index) and len(slave.read(index)) > 7:
-            return index, 0
+            return index
     raise Skipped("the slave has no text that needs a segmented upload")
 
 
 @item("CiA 301, 7.2.4.3.6", "segmented upload of a text", "as many bytes as announced")
 def sdo_segmented_upload(slave: Slave) -> str:
-    index, sub = _segmented(slave)
-    data = slave.read(index, sub)
-    begin = unless_aborted(slave.request(b"\x40" + multiplexer(index, sub)))
+    index = _segmented(slave)
+    where = multiplexer(index, 0)
+    data = slave.read(index)
+    begin = slave.ask(b"\x40" + where, where)
     require(begin[0] & 0xFE == 0x40, f"command specifier {begin[0]:02X}h")
     announced = int.from_bytes(begin[4:], "little")
-    slave.send_request(b"\x80" + multiplexer(index, sub) + bytes(4))
+    slave.send_request(b"\x80" + where + bytes(4))
     if begin[0] & 1:
         require(announced == len(data), f"{announced} announced, {len(data)} received")
     return f"{len(data)} bytes"
@@ -205,16 +206,18 @@ def sdo_segmented_upload(slave: Slave) -> str:
 
 @item("CiA 301, 7.2.4.3.17", "segment with the wrong toggle bit", "abort 05030000h")
 def sdo_toggle_bit(slave: Slave) -> str:
-    index, sub = _segmented(slave)
-    unless_aborted(slave.request(b"\x40" + multiplexer(index, sub)))
-    return require_abort(lambda: unless_aborted(slave.request(b"\x70")), TOGGLE)
+    index = _segmented(slave)
+    where = multiplexer(index, 0)
+    slave.ask(b"\x40" + where, where)
+    return require_abort(lambda: slave.ask(b"\x70", where), TOGGLE)
 
 
 @item("CiA 301, 7.2.4.3.17", "abort by the client, then an upload", "only the upload is answered")
 def sdo_abort_by_the_client(slave: Slave) -> str:
-    index, sub = _segmented(slave)
-    unless_aborted(slave.request(b"\x40" + multiplexer(index, sub)))
-    slave.send_request(b"\x80" + multiplexer(index, sub) + b"\0\0\0\x08")
+    index = _segmented(slave)
+    where = multiplexer(index, 0)
+    slave.ask(b"\x40" + where, where)
+    slave.send_request(b"\x80" + where + b"\0\0\0\x08")
     answers = slave.answers_until_answer()
     require(not answers, "the abort was answered")
     return "only the upload was answered"
@@ -222,8 +225,9 @@ def sdo_abort_by_the_client(slave: Slave) -> str:
 
 @item("CiA 301, 7.2.4.3", "a new upload during a segmented upload", "the new upload is answered")
 def sdo_new_transfer_replaces_the_old_one(slave: Slave) -> str:
-    index, sub = _segmented(slave)
-    unless_aborted(slave.request(b"\x40" + multiplexer(index, sub)))
+    index = _segmented(slave)
+    where = multiplexer(index, 0)
+    slave.ask(b"\x40" + where, where)
     slave.read(0x1000)
     return "it was answered"
 
@@ -232,8 +236,8 @@ def sdo_new_transfer_replaces_the_old_one(slave: Slave) -> str:
 def sdo_segmented_download(slave: Slave) -> str:
     require_heartbeat(slave)
     where = multiplexer(HEARTBEAT_TIME, 0)
-    unless_aborted(slave.request(b"\x21" + where + b"\2\0\0\0"))
-    answer = unless_aborted(slave.request(b"\x0b" + (4321).to_bytes(2, "little")))
+    slave.ask(b"\x21" + where + b"\2\0\0\0", where)
+    answer = slave.ask(b"\x0b" + (4321).to_bytes(2, "little"), where)
     require(answer[0] == 0x20, f"command specifier {answer[0]:02X}h")
     found = slave.number(HEARTBEAT_TIME)
     require(found == 4321, str(found))
@@ -246,11 +250,11 @@ def sdo_segmented_download(slave: Slave) -> str:
     "the data of a segmented upload, and its CRC",
 )
 def sdo_block_upload(slave: Slave) -> str:
-    index, sub = _segmented(slave)
-    plain = slave.read(index, sub)
-    begin = slave.request(b"\xa4" + multiplexer(index, sub) + b"\x7f")
+    index = _segmented(slave)
+    where = multiplexer(index, 0)
+    plain = slave.read(index)
     try:
-        unless_aborted(begin)
+        begin = slave.ask(b"\xa4" + where + b"\x7f", where)
     except SdoAbort as abort:
         if abort.code in (UNKNOWN_COMMAND, UNSUPPORTED_ACCESS):
             raise Skipped(f"no block transfer ({abort})") from None
@@ -270,7 +274,7 @@ def sdo_block_upload(slave: Slave) -> str:
         if part[0] & 0x80:
             break
         slave.send_request(confirmation)
-    end = unless_aborted(slave.request(confirmation))
+    end = slave.ask(confirmation, where)
     require(end[0] & 0xE3 == 0xC1, f"command specifier {end[0]:02X}h at the end")
     unused = end[0] >> 2 & 7
     data = data[: len(data) - unused]

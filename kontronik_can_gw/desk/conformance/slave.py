@@ -8,9 +8,11 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
+from kontronik_can_gw.desk.conformance.eds_file import EdsFile
+
 if TYPE_CHECKING:
     import can
-    from canopen.objectdictionary import ObjectDictionary, ODVariable
+    from canopen.objectdictionary import ODVariable
 
 ABORT = 0x80
 _NMT = 0x000
@@ -18,7 +20,7 @@ _SYNC = 0x080
 _HEARTBEAT = 0x700
 _SDO_REQUEST = 0x600
 _SDO_ANSWER = 0x580
-_RESET_S = 0.1
+RESET_S = 0.1
 """Pause after the reset of a slave that sends no boot-up message."""
 DEVICE_TYPE = 0x1000
 """An object that every slave has and that can be read."""
@@ -30,7 +32,7 @@ class ReceivedFrame(NamedTuple):
     can_id: int
     data: bytes
     time_s: float
-    """Time of ``time.monotonic`` at which it was read."""
+    """Time of the slave's clock at which it was read."""
 
 
 class NoAnswer(Exception):
@@ -46,21 +48,23 @@ class SdoAbort(Exception):
 
 
 class Slave:
-    """A slave on a bus. Every wait ends after ``limit_s`` seconds."""
+    """A slave on a bus. Every wait ends after ``limit_s`` seconds of ``clock``."""
 
     def __init__(
         self,
         bus: "can.BusABC",
         node_id: int,
-        dictionary: "ObjectDictionary",
-        eds_text: str,
+        eds: EdsFile,
         limit_s: float,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.bus = bus
         self.node_id = node_id
-        self.dictionary = dictionary
-        self.eds_text = eds_text
+        self.eds = eds.sections
+        self.dictionary = eds.dictionary
         self.limit_s = limit_s
+        self.clock = clock
+        """Returns the time in seconds. The bus waits by the same clock."""
         self.sends_boot_up = True
         """False after a reset without a boot-up message. Then no further one is waited for."""
         self.other_nodes: set[int] = set()
@@ -84,17 +88,17 @@ class Slave:
         self.bus.send(message, timeout=self.limit_s)
 
     def receive(self, until_s: float) -> ReceivedFrame | None:
-        """Return the next frame. None if there is none until this time of ``time.monotonic``.
+        """Return the next frame, or None if no frame arrives until this time of the clock.
 
         A time in the past returns a frame that has arrived already.
         """
         while True:
-            message = self.bus.recv(max(0.0, until_s - time.monotonic()))
+            message = self.bus.recv(max(0.0, until_s - self.clock()))
             if message is None:
                 return None
             is_data = not (message.is_error_frame or message.is_remote_frame)
             if is_data and not message.is_extended_id:
-                frame = ReceivedFrame(message.arbitration_id, bytes(message.data), time.monotonic())
+                frame = ReceivedFrame(message.arbitration_id, bytes(message.data), self.clock())
                 self._note_other_node(frame)
                 return frame
 
@@ -114,7 +118,7 @@ class Slave:
         self, condition: Callable[[ReceivedFrame], bool], limit_s: float | None = None
     ) -> ReceivedFrame:
         """Return the first frame that meets a condition. Raises NoAnswer after the limit."""
-        until_s = time.monotonic() + (self.limit_s if limit_s is None else limit_s)
+        until_s = self.clock() + (self.limit_s if limit_s is None else limit_s)
         while (frame := self.receive(until_s)) is not None:
             if condition(frame):
                 return frame
@@ -123,7 +127,7 @@ class Slave:
     def frames_during(self, seconds: float) -> list[ReceivedFrame]:
         """Return all frames that arrive within this time."""
         frames = []
-        until_s = time.monotonic() + seconds
+        until_s = self.clock() + seconds
         while (frame := self.receive(until_s)) is not None:
             frames.append(frame)
         return frames
@@ -136,7 +140,7 @@ class Slave:
         where = multiplexer(DEVICE_TYPE, 0)
         frames = self.waiting_frames()
         self.send_request(b"\x40" + where)
-        until_s = time.monotonic() + self.limit_s
+        until_s = self.clock() + self.limit_s
         while (frame := self.receive(until_s)) is not None:
             if self.is_answer(frame) and frame.data[1:4] == where:
                 return frames
@@ -171,7 +175,7 @@ class Slave:
         self.waiting_frames()
         self.nmt(command)
         frames: list[ReceivedFrame] = []
-        until_s = time.monotonic() + self.limit_s
+        until_s = self.clock() + self.limit_s
         while self.sends_boot_up:
             frame = self.receive(until_s)
             if frame is None:
@@ -182,7 +186,7 @@ class Slave:
                 break
         else:
             # its reset may still last, and would undo the effect of later commands
-            frames += self.frames_during(_RESET_S)
+            frames += self.frames_during(RESET_S)
         self.nmt(0x80)
         return frames + self.frames_until_answer()
 
@@ -197,6 +201,19 @@ class Slave:
         self.send_request(data)
         return self.wait_for(self.is_answer).data.ljust(8, b"\0")
 
+    def ask(self, data: bytes, where: bytes | None) -> bytes:
+        """Send an SDO request and return the answer.
+
+        ``where`` is the multiplexer of the transfer, or None without a transfer. Raises
+        SdoAbort if the slave aborts the transfer, and UnexpectedAnswer if it names another object.
+        """
+        answer = self.request(data)
+        if answer[0] != ABORT:
+            return answer
+        if where is not None and answer[1:4] != where:
+            raise UnexpectedAnswer(answer, f"which does not name {name_of_object(where)}")
+        raise SdoAbort(int.from_bytes(answer[4:8], "little"))
+
     def send_request(self, data: bytes) -> None:
         """Send an SDO request without waiting for an answer."""
         self.send(_SDO_REQUEST + self.node_id, data.ljust(8, b"\0"))
@@ -206,8 +223,9 @@ class Slave:
 
     def read(self, index: int, sub: int = 0) -> bytes:
         """Return the data of an object, by an expedited or a segmented upload. Raises SdoAbort."""
-        answer = unless_aborted(self.request(b"\x40" + multiplexer(index, sub)))
-        if answer[0] & 0xE0 != 0x40 or answer[1:4] != multiplexer(index, sub):
+        where = multiplexer(index, sub)
+        answer = self.ask(b"\x40" + where, where)
+        if answer[0] & 0xE0 != 0x40 or answer[1:4] != where:
             raise UnexpectedAnswer(answer)
         if answer[0] & 2:
             unused = answer[0] >> 2 & 3 if answer[0] & 1 else 0
@@ -215,7 +233,7 @@ class Slave:
         data = b""
         toggle = 0
         while True:
-            part = unless_aborted(self.request(bytes((0x60 | toggle,))))
+            part = self.ask(bytes((0x60 | toggle,)), where)
             if part[0] & 0xF0 != toggle:
                 raise UnexpectedAnswer(part)
             data += part[1 : 8 - (part[0] >> 1 & 7)]
@@ -230,8 +248,9 @@ class Slave:
     def write(self, index: int, sub: int, data: bytes) -> None:
         """Write 1 to 4 bytes by an expedited download. Raises SdoAbort."""
         command = bytes((0x23 | 4 - len(data) << 2,))
-        answer = unless_aborted(self.request(command + multiplexer(index, sub) + data))
-        if answer[:4] != b"\x60" + multiplexer(index, sub):
+        where = multiplexer(index, sub)
+        answer = self.ask(command + where + data, where)
+        if answer[:4] != b"\x60" + where:
             raise UnexpectedAnswer(answer)
 
     def write_number(self, index: int, sub: int, value: int) -> None:
@@ -275,8 +294,9 @@ class Slave:
 class UnexpectedAnswer(Exception):
     """An SDO answer does not fit its request."""
 
-    def __init__(self, answer: bytes) -> None:
-        super().__init__(f"answer {answer.hex(' ').upper()}")
+    def __init__(self, answer: bytes, reason: str = "") -> None:
+        shown = f"answer {answer.hex(' ').upper()}"
+        super().__init__(f"{shown}, {reason}" if reason else shown)
 
 
 def multiplexer(index: int, sub: int) -> bytes:
@@ -284,8 +304,6 @@ def multiplexer(index: int, sub: int) -> bytes:
     return index.to_bytes(2, "little") + bytes((sub,))
 
 
-def unless_aborted(answer: bytes) -> bytes:
-    """Return an SDO answer. Raises SdoAbort if it aborts the transfer."""
-    if answer[0] == ABORT:
-        raise SdoAbort(int.from_bytes(answer[4:8], "little"))
-    return answer
+def name_of_object(where: bytes) -> str:
+    """Return the name of a multiplexer, for example "1018h:01"."""
+    return f"{int.from_bytes(where[:2], 'little'):04X}h:{where[2]:02X}"
