@@ -195,8 +195,15 @@ def test_only_its_own_folder_uses_the_wire_protocol() -> None:
             assert not known, f"{name} knows the wire"
 
 
-OUTPUT_TOOLS = ("cli/common.py", "cli/dbc.py", "cli/describe.py", "cli/eds.py", "desk/describe/")
-"""Modules that describe CANopen nodes: commands for EDS and DBC files, and tables."""
+OUTPUT_TOOLS = (
+    "cli/common.py",
+    "cli/dbc.py",
+    "cli/describe.py",
+    "cli/eds.py",
+    "desk/conformance/eds_",
+    "desk/describe/",
+)
+"""Modules that describe CANopen nodes: commands for EDS and DBC files, tables, a slave's EDS."""
 
 
 def test_only_its_own_tools_import_an_output() -> None:
