@@ -234,10 +234,13 @@ def _check(header: Header) -> None:
         ("wall_ns", LATEST_NS),
     ):
         if header.get(name) is not None:
-            whole_number(header[name], 0, latest)
+            with reading(name):
+                whole_number(header[name], 0, latest)
     for name in ("run", "file"):
-        short_text(header.get(name, ""), _MAX_PATH)
-    whole_number(header.get("part", 0), 0, 1 << 32)
+        with reading(name):
+            short_text(header.get(name, ""), _MAX_PATH)
+    with reading("part"):
+        whole_number(header.get("part", 0), 0, 1 << 32)
     for name, part_type in _TYPES.items():
         if not isinstance(header.get(name, part_type()), part_type):
             raise HeaderError(f'"{name}" is not a {_JSON_NAMES[part_type]}')
@@ -245,4 +248,5 @@ def _check(header: Header) -> None:
         raise HeaderError(f'"escs" does not have 1 to {_MAX_ESCS} entries')
     if not isinstance(header["configuration"], str):
         raise HeaderError('"configuration" is not a text')
-    check_state(header.get("state", {}))
+    with reading("state"):
+        check_state(header.get("state", {}))

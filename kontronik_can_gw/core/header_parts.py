@@ -33,11 +33,17 @@ class HeaderError(ValueError):
     """A header that no recorder has written. The text is for users."""
 
 
+class _WrongValue(HeaderError):
+    """The value and its rule, before the part of the header is known."""
+
+
 @contextmanager
 def reading(part: str) -> Iterator[None]:
     """Turn errors of Python into a HeaderError that names this part of the header."""
     try:
         yield
+    except _WrongValue as error:
+        raise HeaderError(f"{part} has {error}") from None
     except (HeaderError, UserError):
         raise
     except KeyError as error:
@@ -51,14 +57,16 @@ def whole_number(value: Any, low: int, high: int) -> int:
     if isinstance(value, str) and len(value) < 20 and value.isdecimal():
         value = int(value)
     if type(value) is not int or not low <= value <= high:
-        raise HeaderError(f"{str(value)[:40]!r} is not a whole number from {low} to {high}")
+        raise _WrongValue(f"{str(value)[:40]!r}, which is not a whole number from {low} to {high}")
     return value
 
 
 def short_text(value: Any, longest: int) -> str:
     """Return a text of a header. HeaderError if it is too long or not printable."""
     if not isinstance(value, str) or len(value) > longest or not value.isprintable():
-        raise HeaderError(f"{str(value)[:40]!r} is not a text of at most {longest} characters")
+        raise _WrongValue(
+            f"{str(value)[:40]!r}, which is not a text of at most {longest} characters"
+        )
     return value
 
 

@@ -12,6 +12,7 @@ from copy import copy
 from typing import TYPE_CHECKING, cast
 
 from kontronik_can_gw.gateway.gateway import Gateway
+from kontronik_can_gw.printable import counted
 from kontronik_can_gw.runtime.can.can_link import CanLink
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.files.parameter_saver import ParameterSaver
@@ -202,7 +203,7 @@ class Housekeeping:
             condition = f"CAN {self._can.config.channel}: {conflict.ids}"
             if conflict.over:
                 text = f"{condition}: no other device uses it now"
-                self._conditions.end(condition, text, now, f"; {conflict.count} frames")
+                self._conditions.end(condition, text, now, f"; {counted(conflict.count, 'frame')}")
                 continue
             remedy = "Two nodes with one node-ID?"
             if conflict.node is None:

@@ -299,6 +299,8 @@ def test_a_refused_header_is_described_in_words_for_users(header: dict[str, Any]
         (("canopen", "eds", "text"), "€", "canopen.eds: the text of the file has '€'"),
         (("canopen", "stored"), ["€"], "canopen.stored has a value of the wrong type or form"),
         (("dbc", "text"), GONE, 'dbc lacks "text"'),
+        (("escs", 0, "pole_pairs"), "x", "escs has 'x', which is not a whole number from 1 to"),
+        (("run",), 5, "run has '5', which is not a text of at most 4096 characters"),
         (("escs", 0, "gear"), 5, "escs has a value of the wrong type or form"),
         (("canopen", "nodes", 0, "serial"), GONE, 'canopen.nodes lacks "serial"'),
         (("ports",), 7, '"ports" is not a list. Use another part of the run'),

@@ -158,11 +158,12 @@ class CaptureInput(PlayedInput):
         yield replay.finish()
         if replay.lost:
             self.damage.append(
-                f"{replay.lost} entries could not be recorded, "
+                f"{_entries(replay.lost)} could not be recorded, "
                 "because the disk was too slow or full"
             )
         if replay.rejected:
-            self.damage.append(f"{replay.rejected} entries cannot be interpreted by this version")
+            rejected = _entries(replay.rejected)
+            self.damage.append(f"{rejected} cannot be interpreted by this version")
 
     def _steps(self, replay: Replay, player: "Player | None") -> Iterator[list[TimedFrame]]:
         """Play all entries on the gateway of ``replay``. Yield the frames of each entry.
@@ -337,7 +338,8 @@ class CaptureInput(PlayedInput):
                 text = "was not closed, so up to a second may be missing at its end"
                 self._add_damage(f"{path.name}: {text}")
         if self._impossible:
-            self.damage.append(f"{self._impossible} entries have an impossible time")
+            verb = "has" if self._impossible == 1 else "have"
+            self.damage.append(f"{_entries(self._impossible)} {verb} an impossible time")
 
     def _add_damage(self, text: str) -> None:
         if len(self.damage) < _MAX_DAMAGE:
@@ -390,6 +392,10 @@ def _clock_of(header: Mapping[str, Any]) -> tuple[int, int] | None:
     if not (0 <= now <= LATEST_NS and 0 <= wall <= LATEST_NS):
         return None
     return int(now), int(wall) - int(now)
+
+
+def _entries(count: int) -> str:
+    return "1 entry" if count == 1 else f"{count} entries"
 
 
 def _events_in_words(events: Any, begin_ns: int) -> str:

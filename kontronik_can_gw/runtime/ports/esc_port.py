@@ -373,7 +373,7 @@ def _describe(line_errors: Mapping[str, int]) -> str:
     counts = []
     for kind, count in line_errors.items():
         if count and kind != "break":
-            counts.append(f"{count} {kind} errors")
+            counts.append(counted(count, f"{kind} error"))
     if not counts:
         return ""
     return f" (the driver counts {', '.join(counts)})"

@@ -25,6 +25,7 @@ from kontronik_can_gw.desk.recordings.can_logs.text import (
 from kontronik_can_gw.desk.recordings.recording import LogFrame
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.light_imports import without_asammdf
+from kontronik_can_gw.printable import counted
 from kontronik_can_gw.times import MS, SECOND
 
 with without_asammdf():
@@ -68,7 +69,7 @@ class LibraryReader(LogReader):
                     except ValueError:
                         wrong += 1
         except Exception as error:  # a damaged file can cause any exception
-            self.damage.append(f"damaged after {done} frames ({_short(error)})")
+            self.damage.append(f"damaged after {counted(done, 'frame')} ({_short(error)})")
         if wrong:
             noun = "damaged frames" if wrong > 1 else "damaged frame"
             self.damage.append(f"{wrong} {noun} left out")
