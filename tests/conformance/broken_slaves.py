@@ -165,9 +165,13 @@ def heartbeat_cannot_be_switched_off(frame: CanFrame, _proxy: Proxy) -> list[Can
 # --- SDO and object dictionary
 
 
-@_request("sdo-toggle-bit", _SDO_REQUEST, "70")
-def toggle_bit_is_ignored(frame: CanFrame, _proxy: Proxy) -> list[CanFrame]:
-    return _with(frame, 0, "60")
+@_request("sdo-toggle-bit", _SDO_REQUEST)
+def toggle_bit_of_the_first_segment_is_ignored(frame: CanFrame, proxy: Proxy) -> list[CanFrame]:
+    is_first = proxy.count == 0x40
+    proxy.count = frame.data[0]
+    if is_first and frame.data[0] == 0x70:
+        return _with(frame, 0, "60")
+    return [frame]
 
 
 @_response("sdo-no-object", _SDO_RESPONSE, "80", "00000206")

@@ -52,6 +52,34 @@ def test_silence_of_a_service_that_does_not_work_is_not_passed() -> None:
     assert set(found.values()) == {"not supported"}
 
 
+def test_a_size_that_is_not_indicated_is_no_fault() -> None:
+    """CiA 301 allows expedited uploads without a size."""
+
+    def hide_size(frame: CanFrame, _proxy: Proxy) -> list[CanFrame]:
+        is_expedited = frame.can_id == 0x581 and frame.data[0] & 0xE3 == 0x43
+        if is_expedited:
+            return [frame._replace(data=b"\x42" + frame.data[1:])]
+        return [frame]
+
+    found = verdicts(simulated_slave(from_node=hide_size))
+    assert {name for name, verdict in found.items() if verdict == "failed"} == {
+        "od-vendor-id-is-assigned"
+    }
+
+
+def test_an_upload_by_segments_instead_of_blocks_is_named() -> None:
+    """LocalNode answers a block upload with a segmented one, which was not permitted."""
+
+    def answer_by_segments(frame: CanFrame, _proxy: Proxy) -> list[CanFrame]:
+        if frame.can_id == 0x601 and frame.data[0] == 0xA4:
+            return [frame._replace(data=b"\x40" + frame.data[1:4] + bytes(4))]
+        return [frame]
+
+    (item,) = [item for item in all_items() if item.name == "sdo-block-upload"]
+    (result,) = run(simulated_slave(from_master=answer_by_segments), [item], {})
+    assert result.answer == "command specifier 41h instead of a block upload"
+
+
 def test_each_item_that_must_be_silent_names_one_that_exists() -> None:
     names = {item.name for item in all_items()}
     needed = {item.needs for item in all_items() if item.needs}

@@ -102,3 +102,12 @@ def test_a_vendor_id_of_your_own_passes_with_its_eds(tmp_path: Path) -> None:
     found = verdicts(read_eds(path, 1), "od-identity", "od-vendor", "od-values", bench=bench)
     assert set(found.values()) == {"passed"}
     assert len(found) == 3
+
+
+def test_an_eds_without_defaults_is_judged(tmp_path: Path) -> None:
+    lines = EDS.read_text().splitlines()
+    path = tmp_path / "x.eds"
+    path.write_text("\n".join(line for line in lines if not line.startswith("DefaultValue")))
+    found = verdicts(read_eds(path, 1), "")
+    failed = {name for name, verdict in found.items() if verdict == "failed"}
+    assert failed == {"od-vendor-id-is-assigned"}

@@ -228,8 +228,9 @@ class Slave:
         if answer[0] & 0xE0 != 0x40 or answer[1:4] != where:
             raise UnexpectedAnswer(answer)
         if answer[0] & 2:
-            unused = answer[0] >> 2 & 3 if answer[0] & 1 else 0
-            return answer[4 : 8 - unused]
+            if answer[0] & 1:
+                return answer[4 : 8 - (answer[0] >> 2 & 3)]
+            return answer[4 : 4 + self._size(index, sub)]  # the slave need not indicate it
         data = b""
         toggle = 0
         while True:
@@ -240,6 +241,15 @@ class Slave:
             toggle ^= 0x10
             if part[0] & 1:
                 return data
+
+    def _size(self, index: int, sub: int) -> int:
+        """Return the number of bytes of an entry's data type, or 4 if it is not fixed."""
+        from canopen.objectdictionary import datatypes
+
+        variable = self.variable(index, sub)
+        if variable is None or variable.data_type not in datatypes.INTEGER_TYPES:
+            return 4
+        return len(variable) // 8
 
     def number(self, index: int, sub: int = 0) -> int:
         """Return the value of an object as an unsigned number. Raises SdoAbort."""

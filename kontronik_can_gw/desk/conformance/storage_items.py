@@ -65,5 +65,6 @@ def store_and_restore(slave: Slave) -> str:
     restored = slave.number(HEARTBEAT_TIME)
     require(stored == 777, f"{stored} ms after save")
     default = None if variable is None else variable.default
-    require(restored == default, f"{restored} ms after load")
+    is_restored = restored != stored if default is None else restored == default
+    require(is_restored, f"{restored} ms after load")
     return f"{stored} ms, {restored} ms"
