@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.capture.calls import CALL_OF, RecordedCall
 from kontronik_can_gw.capture.format import (
     COUNTERS,
+    VERSION,
     Entry,
     EntryKind,
     read_json,
@@ -44,7 +45,9 @@ class Replay:
     ``marked``: the gateway's state on the bus is REPLAY instead of RUNNING. ``state``: the counters
     in the header. If the beginning of the run is missing (no START entry), the gateway starts with
     the first ADVANCE entry and adopts the STATE entries of the next seconds (SETTLE_NS). After them
-    the messages equal the live ones.
+    the messages equal the live ones. ``version``: the version of the capture's format. A gateway
+    that wrote version 1 did not count a lost port as a loss of telemetry, so its replay does not
+    either.
     """
 
     def __init__(
@@ -52,6 +55,7 @@ class Replay:
         gateway: Gateway,
         state: Mapping[str, Any] | None = None,
         marked: bool = False,
+        version: int = VERSION,
     ) -> None:
         self.gateway = gateway
         self.lost = 0
@@ -59,6 +63,7 @@ class Replay:
         self.rejected = 0
         """Number of entries that are invalid."""
         self._marked = marked
+        self._counts_lost_ports = version > 1
         self._waiting = TransmitQueue()
         self._taken: list[TimedFrame] = []
         """Frames of the last turn. The next entry shows if they were sent."""
@@ -118,6 +123,9 @@ class Replay:
         if not self._started and call.kind == EntryKind.ADVANCE:  # the run's beginning is missing
             self._adopt_until = entry.time_ns + SETTLE_NS
             self._make_call(CALL_OF[EntryKind.START], (entry.time_ns, True))
+        if call.kind == EntryKind.PORT_LOST and not self._counts_lost_ports:
+            esc = self.gateway.escs[entry.esc]
+            esc.losses -= int(esc.up)  # the call adds one
         arguments = call.encoding.read(entry)
         result = self._make_call(call, arguments)
         if call.takes_frames:

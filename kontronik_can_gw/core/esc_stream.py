@@ -174,7 +174,6 @@ class EscStream(EscTelemetry):
         """Drop live and info data that is too old at ``now``. Return the events."""
         events = Event.NONE
         if self.live is not None and now - self.live_bound_ns > self.settings.timeout_ns:
-            self.losses += 1
             events |= self._lose(LinkState.LOST)
         if self.info_bound_ns is not None and now - self.info_bound_ns > INFO_TIMEOUT_NS:
             self._forget_device()
@@ -283,6 +282,7 @@ class EscStream(EscTelemetry):
         events = self._set_link(state)
         if self.live is not None:
             self.live = None
+            self.losses += 1
             events |= Event.LIVE
         if self.info is not None:
             self._forget_device()

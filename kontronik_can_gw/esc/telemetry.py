@@ -118,7 +118,7 @@ class EscTelemetry:
     None in the first second after the link came up.
     """
     losses: int = 0
-    """How often ``live`` became too old."""
+    """How often ``live`` became None: it was too old, or the port was lost."""
     suspect_frames: int = 0
     """Live frames with an impossible value outside their checksum."""
     late_frames: int = 0

@@ -384,6 +384,7 @@ static int lose(kcg_esc *e, int state)
     int events = set_link(e, state);
     if (e->has_live) {
         e->has_live = 0;
+        e->count[KCG_N_LOSSES]++;
         e->generation++;
         events |= KCG_LIVE;
     }
@@ -429,10 +430,8 @@ static int64_t esc_deadline(const kcg *g, const kcg_esc *e)
 static int expire_esc(kcg_esc *e, int64_t now)
 {
     int events = 0;
-    if (now >= end_of_live(e)) {
-        e->count[KCG_N_LOSSES]++;
+    if (now >= end_of_live(e))
         events = lose(e, KCG_LOST);
-    }
     if (now >= end_of_info(e)) {
         forget_device(e);
         events |= KCG_INFO;

@@ -122,6 +122,31 @@ def test_counters_without_a_cycle_do_not_go_stale(kind: str, name: str, per_seco
     assert 3 * per_second <= int.from_bytes(sent[-1][:4], "little") <= 5 * per_second
 
 
+def test_each_loss_of_telemetry_counts_once_whatever_its_cause() -> None:
+    bench = Bench(SPEED)
+    esc = bench.gateway.escs[0]
+
+    def lose_port() -> None:
+        bench.gateway.port(0, False, bench.now)
+
+    def time_out() -> None:
+        bench.wait(SECOND)
+
+    lose_port()
+    bench.gateway.port(0, True, bench.now)
+    time_out()
+    assert esc.losses == 0  # no value was fresh
+    for losses, causes in enumerate(
+        ([lose_port], [time_out], [time_out, lose_port], [lose_port, lose_port, time_out]), 1
+    ):
+        bench.live(electrical_speed=losses)
+        for lose in causes:
+            lose()
+            assert not esc.up
+            assert esc.losses == losses
+        bench.gateway.port(0, True, bench.now)
+
+
 @pytest.mark.parametrize(
     ("more", "link"),
     [

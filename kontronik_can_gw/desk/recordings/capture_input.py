@@ -146,7 +146,7 @@ class CaptureInput(PlayedInput):
     def _play(
         self, gateway: "Gateway", player: "Player | None" = None
     ) -> "Iterator[list[TimedFrame] | Frames]":
-        replay = Replay(gateway, self.header.get("state"), self.marked)
+        replay = Replay(gateway, self.header.get("state"), self.marked, self.setup.version)
         for frames in self._steps(replay, player):
             if player is not None:
                 sent = player.take_frames()
