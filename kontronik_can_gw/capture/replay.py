@@ -127,10 +127,6 @@ class Replay:
             esc = self.gateway.escs[entry.esc]
             esc.losses -= int(esc.up)  # the call adds one
         arguments = call.encoding.read(entry)
-        if call.kind == EntryKind.PORT_LOST and not self._counts_lost_ports:
-            esc = self.gateway.escs[entry.esc]
-            if esc.up:
-                esc.losses -= 1  # the call adds one
         result = self._make_call(call, arguments)
         if call.takes_frames:
             self._collect_frames(entry.time_ns)
