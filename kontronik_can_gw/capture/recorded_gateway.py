@@ -144,16 +144,18 @@ def state_of(gateway: RecordedGateway) -> dict[str, Any]:
             "line_errors": esc.line_errors,
         }
         escs.append(counters | esc.stream_state())
-    return {
+    state = {
         "escs": escs,
         "messages": gateway.core.places(),
         "counters": gateway.recorded_counters,
         "can_state": int(gateway.status.can_state),
         "is_held": int(gateway.is_held),
-        "is_limited": int(gateway.is_limited),
         "started_ns": gateway.status.started_ns,
         "heard_ns": max([gateway.status.heard_ns, *[esc.live_ns or 0 for esc in gateway.escs]]),
     }
+    if gateway.is_limited:  # rare, and each segment of an event recording has a state
+        state["is_limited"] = 1
+    return state
 
 
 def devices_of(gateway: Gateway) -> list[dict[str, Any] | None]:

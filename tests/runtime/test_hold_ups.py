@@ -865,7 +865,7 @@ def test_the_end_of_a_loop_is_logged_with_reason_and_totals(
     assert sent > 100
     expected = (
         "stopped by SIGTERM after 2.0 s: 100 live frames received, 0 CRC errors, "
-        f"telemetry lost 1 times; {sent} CAN frames sent, 0 dropped, bus-off 0 times"
+        f"telemetry lost 1 time; {sent} CAN frames sent, 0 dropped, bus-off 0 times"
     )
     assert loop.conditions.recent[-1].endswith(expected)
 
