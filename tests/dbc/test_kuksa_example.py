@@ -5,8 +5,6 @@ The provider is on no package index. kuksa_mapping.schema.json has the rules of 
 """
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -117,28 +115,6 @@ def nodes(children: Any = MAPPING, prefix: str = "") -> Iterator[tuple[str, Any]
 def test_the_overlay_has_the_nodes_of_the_mapping() -> None:
     yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
     assert yaml.safe_load(OVERLAY.read_text()) == dict(nodes())
-
-
-@pytest.mark.parametrize("celsius", ["celsius", "Celsius"])
-def test_vss_tools_accept_the_overlay(celsius: str, tmp_path: Path) -> None:
-    """``celsius`` is the name of this unit in VSS 5 or 6, which vss-tools read from a file."""
-    vspec = Path(sys.executable).with_name("vspec")
-    if not vspec.exists():
-        pytest.skip("vss-tools is not installed: pip install vss-tools")
-    units = {**UNITS_OF_VSS, celsius: "temperature"}
-    entry = "{{definition: x, unit: 'name of {}', quantity: {}, allowed-datatypes: [numeric]}}"
-    texts = {
-        "base.vspec": "Vehicle:\n  type: branch\n  description: The vehicle.\n",
-        "units.yaml": "\n".join(f"{key}: {entry.format(key, of)}" for key, of in units.items()),
-        "quantities.yaml": "\n".join(f"{of}: {{definition: x}}" for of in units.values()),
-    }
-    for name, text in texts.items():
-        (tmp_path / name).write_text(text)
-    command = [str(vspec), "export", "json", "--strict"]
-    files = ["-s", "base.vspec", "-u", "units.yaml", "-q", "quantities.yaml", "-l", str(OVERLAY)]
-    more = ["-e", "dbc2vss", "-o", "out.json"]
-    subprocess.run([*command, *files, *more], cwd=tmp_path, check=True)
-    assert dict(sensors(json.loads((tmp_path / "out.json").read_text()))) == SENSORS
 
 
 @pytest.mark.parametrize("name", sorted(SENSORS))
