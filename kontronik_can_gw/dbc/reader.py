@@ -163,8 +163,8 @@ def parse_database(
     return database
 
 
-_SYNTAX = re.compile(r'(?:DBC: ")?Invalid syntax at (line \d+, column \d+): "(.*)>>!<<(.*)""?')
-"""An error of cantools. ``>>!<<`` is the place of the mistake in its line."""
+_SYNTAX = re.compile(r'(?:DBC: ")?Invalid syntax at (line \d+, column \d+): "([A-Z_]*)')
+"""An error of cantools: its place, and the keyword at the beginning of the line."""
 
 
 def _reason(error: Exception) -> str:
@@ -173,10 +173,10 @@ def _reason(error: Exception) -> str:
     found = _SYNTAX.match(text)
     if found is None:
         return f"cannot be read as a DBC: {text.removeprefix('DBC: ')}"
-    where, before, after = found.groups()
-    at = f"after {before.strip()!r}" if before.strip() else "at the beginning of the line"
-    unknown = after.split('"')[0].strip() or "the end of the line"
-    return f"{where}: is not as in a DBC {at}: {unknown}. Correct it."
+    where, keyword = found.groups()
+    # the rest of the line is not shown, because it may hold a secret, and a support bundle has this
+    entry = f", in the entry {keyword}" if keyword else ""
+    return f"{where}: is not as in a DBC{entry}. Correct it."
 
 
 def _refuse_other_formats(text: str, path: str) -> None:
