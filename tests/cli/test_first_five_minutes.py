@@ -24,7 +24,7 @@ IN_THIS_ORDER = (
     ("doctor", 2, NO_CONFIGURATION),
     ("init", 0, "Edit it, then: kontronik-can-gw check -c gateway.toml"),
     ("init", 2, "gateway.toml: exists"),
-    ("check", 0, "is the example's port"),
+    ("check", 0, "is only an example"),
     ("run", 1, "Is the adapter plugged in?"),
     ("doctor", 1, "Plug in the adapter"),
     ("monitor nocan7", 1, "CAN interface nocan7: "),

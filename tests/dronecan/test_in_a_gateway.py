@@ -115,7 +115,7 @@ def test_check_warns_of_unusual_settings(
     [
         ({"node_id": 125, "per_esc_nodes": True}, "node_id: the last node would have node-ID 126."),
         ({"first_index": 31}, "first_index: the last ESC would have esc_index 32."),
-        ({"name": "Left"}, "name: 'Left' is not a name of 1 to 60 lower-case letters"),
+        ({"name": "Left"}, 'name: "Left" is not a name of 1 to 60 lower-case letters'),
     ],
 )
 def test_a_mistake_is_refused_in_one_line(table: dict[str, Any], reason: str) -> None:

@@ -199,8 +199,8 @@ def test_line_is_set_without_parity() -> None:
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"protocol": "kiss", "device": "KOSMIK"}, "'KOSMIK' is not a device of the protocol kiss"),
-        ({"protocol": "kis"}, "unknown value 'kis'. Did you mean kiss?"),
+        ({"protocol": "kiss", "device": "KOSMIK"}, '"KOSMIK" is not a device of the protocol kiss'),
+        ({"protocol": "kis"}, 'unknown value "kis". Did you mean kiss?'),
     ],
 )
 def test_invalid_key_of_its_configuration_is_refused(wrong: dict[str, str], said: str) -> None:

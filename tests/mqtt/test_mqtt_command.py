@@ -19,7 +19,7 @@ def configuration(folder: Path, mqtt: str) -> Path:
     ("mqtt", "words", "code", "said"),
     [
         ("", [], 2, "no broker. Give --broker HOST"),
-        ("", ["--broker", "a b"], 2, "--broker: 'a b' is not a broker"),
+        ("", ["--broker", "a b"], 2, '--broker: "a b" is not a broker'),
         ("", ["flight.kcap"], 2, "Type kontronik-can-gw replay flight.kcap --on can"),
         (HERE + "ca_file = 'x'\n", [], 2, "mqtt.ca_file: has no effect without mqtt.tls"),
         (HERE + "password_file = 'x'\n", [], 2,
