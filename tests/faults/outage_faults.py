@@ -22,6 +22,8 @@ from raw_bus import RawBus
 from restart_unit import RestartUnit
 
 RESTART_AFTER_S = 0.5
+WORKED_S = 3
+"""Time after which the last restart counts as successful, so that the next pause is short."""
 CALM_S = 70
 """After this time without a fault, the log does not summarise further ones."""
 QUIET_AFTER_S = 2
@@ -185,7 +187,7 @@ for _name, _cause in CAUSES.items():
 )
 def hangs_until_restart(bench: Bench, injection: Injection, number: int) -> None:
     """The recovery counts from the hang, because the unit ends it."""
-    time.sleep(number * 0.037 % 1)
+    time.sleep(WORKED_S + number * 0.037 % 1)
     restarts = UNITS[0].starts
     injection.cleared()
     near().is_stuck_until_restart = True

@@ -176,6 +176,7 @@ def test_a_request_changes_the_file_of_the_interface(tmp_path: Path) -> None:
     request("can7")
     first = request_file("can7").stat().st_mtime_ns
     assert request_file("can7") == tmp_path / "run/kontronik-can-gw/restart/can7"
+    os.utime(request_file("can7"), ns=(first, first - SECOND))
     request("can7")
     assert request_file("can7").stat().st_mtime_ns >= first
     assert request_file("can7").read_bytes() == b""

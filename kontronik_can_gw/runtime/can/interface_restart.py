@@ -26,8 +26,10 @@ def request(channel: str) -> None:
     """Request a restart. Does nothing if the file cannot be written."""
     with contextlib.suppress(OSError):
         folders.make_runtime_folder(FOLDER)
-        # closing a file that was opened for writing is a change for systemd
-        os.close(open_regular(request_file(channel), os.O_WRONLY | os.O_CREAT))
+        fd = open_regular(request_file(channel), os.O_WRONLY | os.O_CREAT)
+        # systemd follows the closing, and programs that poll follow the time of the change
+        with contextlib.closing(os.fdopen(fd, "wb")):
+            os.utime(fd)
 
 
 def remedy(channel: str) -> str:
