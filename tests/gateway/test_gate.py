@@ -35,7 +35,7 @@ from kontronik_can_gw.times import MS, NEVER, SECOND
 TIMEOUT = 200 * MS
 RESTART_AFTER = SECOND // 2
 MOST_STATES = int(os.environ.get("KCG_GATE_STATES", "2500"))
-"""States that one run of the test explores. ``make prove`` explores all of them."""
+"""States that one run of the test explores. A larger number takes longer and finds more."""
 FRAMES = 2
 """Frames that are accepted at once."""
 
