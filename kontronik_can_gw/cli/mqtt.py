@@ -59,7 +59,7 @@ EPILOG = (
     "configuration (-c, or gateway.toml). "
     "If the broker is missing, lost or refuses the connection, this is reported once, and mqtt "
     "retries until it is connected. "
-    "SIGTERM and SIGINT publish 'offline' and end mqtt within half a second. "
+    "SIGTERM and SIGINT publish 'offline' and end mqtt. It waits for the broker for at most 0.3 s. "
     "If link_state has its own message on the bus, it "
     "can still be Lost for up to one cycle of that message after a gap, while available is "
     "already true."
