@@ -7,6 +7,7 @@ data. In that case nothing was written. Messages are the work of cli/convert.py.
 import errno
 import fcntl
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -37,6 +38,7 @@ SUFFIXES = {
     ".trc": "trc",
     ".bin": BYTES,
 }
+_STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ON_SCREEN = ("csv", "jsonl", "candump", "asc", "trc")
 """Formats that can be written to standard output or a pipe: they are text, written in order."""
 
@@ -93,12 +95,16 @@ class OutputFile:
         check_part(part, force=self._force)
         if self._force:
             part.unlink(missing_ok=True)
+        # A signal waits until it is known that the part is ours, so that it is removed.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
         try:
             file = part.open("xb")  # does not follow a link that another user made
+            self._part = part
         except FileExistsError:  # another process was faster
             check_part(part, force=False)
             raise
-        self._part = part
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         # Some file systems have no locks. Then another process relies on the name.
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
