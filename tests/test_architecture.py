@@ -10,6 +10,8 @@ import pytest
 
 from kontronik_can_gw.core.output_setup import OUTPUTS
 
+pytestmark = pytest.mark.promise("structure")
+
 PACKAGE = Path(__file__).resolve().parents[1] / "kontronik_can_gw"
 NAME = "kontronik_can_gw"
 ORDER = (
@@ -137,6 +139,7 @@ def _calls(path: Path) -> set[str]:
     return {function.id for function in called if isinstance(function, ast.Name)}
 
 
+@pytest.mark.promise("sans-io")
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_only_the_edge_blocks_and_no_module_compiles_text(path: Path) -> None:
     assert not _calls(path) & {"exec", "eval", "compile"}
@@ -153,6 +156,7 @@ def test_the_protocol_imports_only_the_standard_library() -> None:
             assert own or top in sys.stdlib_module_names, f"{path.name}: {module}"
 
 
+@pytest.mark.promise("silent-to-esc")
 def test_no_serial_port_is_ever_written() -> None:
     """The module that owns the port neither calls nor defines a method that writes."""
     tree = ast.parse((PACKAGE / "runtime" / "ports" / "serial_port.py").read_text(encoding="utf-8"))
@@ -166,6 +170,7 @@ def test_no_serial_port_is_ever_written() -> None:
     assert not any("write" in name or "send" in name for name in defined)
 
 
+@pytest.mark.promise("layout-in-files")
 def test_the_package_contains_no_can_id_of_the_shipped_dbc() -> None:
     """Ids of the shipped DBC do not appear in the modules of the package."""
     for path in MODULES:
@@ -174,6 +179,7 @@ def test_the_package_contains_no_can_id_of_the_shipped_dbc() -> None:
                 assert not 0x680 <= node.value <= 0x6DF, f"{path}: {node.value:#x}"
 
 
+@pytest.mark.promise("wire-private")
 def test_only_its_own_folder_uses_the_wire_protocol() -> None:
     """Only protocols.py imports a protocol.
 
@@ -206,6 +212,7 @@ OUTPUT_TOOLS = (
 """Modules that describe CANopen nodes: commands for EDS and DBC files, tables, a slave's EDS."""
 
 
+@pytest.mark.promise("wire-private")
 def test_only_its_own_tools_import_an_output() -> None:
     """Everything else uses an output through core/output.py and core/output_setup.py."""
     rooms = tuple(f"{NAME}.{output}" for output in OUTPUTS)
@@ -238,6 +245,7 @@ def _sizes(tree: ast.AST, place: str) -> Iterator[tuple[str, int]]:
         yield from _sizes(node, inside)
 
 
+@pytest.mark.promise("small")
 def test_files_classes_and_functions_fit_their_limits() -> None:
     """Split by subject if one of them grows too large to read."""
     found: dict[str, int] = {}

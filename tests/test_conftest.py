@@ -15,6 +15,8 @@ from built import ASK, PROGRAMS, there
 
 from kontronik_can_gw.runtime.system.folders import runtime_folder
 
+pytestmark = pytest.mark.promise("independent-tests")
+
 TESTS = Path(__file__).parent
 IGNORING = ["sh", "-c", 'trap "" HUP INT QUIT; exec "$@"', "sh", sys.executable, "-c"]
 """Command that starts Python as nohup and a shell's background job do: it ignores signals."""

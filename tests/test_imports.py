@@ -20,6 +20,8 @@ from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 
+pytestmark = pytest.mark.promise("light")
+
 LIVE = encode(LiveData(electrical_speed=12_345, battery_voltage=2442), WireLayout.V4)
 STANDIN = Path(__file__).resolve().parent / "benchmarks"
 

@@ -12,6 +12,8 @@ from typing import Any
 import pytest
 import run as checks
 
+pytestmark = pytest.mark.promise("independent-tests")
+
 CASES = {
     "passed": "<testcase classname='a' name='b'/>",
     "failed": "<testcase name='crc'><failure message='3 is not 4'>trace</failure></testcase>",

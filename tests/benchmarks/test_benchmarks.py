@@ -7,6 +7,8 @@ import pytest
 from busy import paused
 from programs import Context, Figure, LeftOut
 
+pytestmark = pytest.mark.promise("sharp-tests")
+
 
 @pytest.mark.extended
 @pytest.mark.usefixtures("c_compiler")

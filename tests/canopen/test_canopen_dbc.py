@@ -33,6 +33,8 @@ from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("shipped-eds")
+
 SHIPPED = Path(__file__).parents[2] / "dbc" / "kontronik_canopen.dbc"
 ONE = (EscSettings("esc1"),)
 PAIR = (EscSettings("left"), EscSettings("right_r", pole_pairs=7, gear=Fraction(5, 2)))

@@ -10,6 +10,10 @@ from dialogue import bench_of
 from script import Dialogue, play_lines, read_dialogues
 from sdo_bench import sdo_bench_of
 
+pytestmark = pytest.mark.promise(
+    "sdo", "pdo", "sync", "nmt", "heartbeats", "emergencies", "lss", "parameters"
+)
+
 FILES = sorted(Path(__file__).parent.glob("dialogues/*.txt"))
 
 

@@ -14,6 +14,8 @@ from kontronik_can_gw.esc.kontronik.codec import encode as uart
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData, rows
 from kontronik_can_gw.status import GatewayState
 
+pytestmark = pytest.mark.promise("object-access")
+
 NO_OBJECT = 0x06020000
 NO_SUB = 0x06090011
 READ_ONLY = 0x06010002
@@ -199,6 +201,7 @@ def lose(bench: Bench) -> None:
     assert bench.number(0x2020, 1) == 4
 
 
+@pytest.mark.promise("true")
 @pytest.mark.parametrize("behaviour", [0, 1, 2])
 def test_lost_values_abort_or_remain_or_are_codes_as_configured(
     behaviour: int,

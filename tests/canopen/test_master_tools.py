@@ -20,6 +20,8 @@ from wire import wire_to
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.status import UNCONFIGURED
 
+pytestmark = pytest.mark.promise("foreign-masters")
+
 EDS = shipped("eds/kontronik_esc.eds")
 BUS = """
 master: {{node_id: 127}}
@@ -115,6 +117,7 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(canopen.lss, "time", SimpleNamespace(sleep=lambda _: None))
 
 
+@pytest.mark.promise("lss")
 def test_a_foreign_master_finds_slaves_by_fastscan_and_sets_node_ids() -> None:
     bench = Bench(node_ids=[UNCONFIGURED] * 6 + [100], changes=QUIET)
     master = master_of(bench)
@@ -131,6 +134,7 @@ def test_a_foreign_master_finds_slaves_by_fastscan_and_sets_node_ids() -> None:
     assert master.fast_scan() == (False, None)
 
 
+@pytest.mark.promise("lss")
 def test_a_foreign_master_configures_and_stores_a_node_id() -> None:
     bench = Bench(node_ids=[UNCONFIGURED] * 3, changes=QUIET)
     master = master_of(bench)

@@ -5,12 +5,15 @@ No exception is raised, states change by the standard, and equal input gives equ
 
 from typing import Any
 
+import pytest
 from dialogue import NO_HEARTBEAT, Bench, default, info, live
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.status import CanState
+
+pytestmark = pytest.mark.promise("nmt")
 
 FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 NODES = 2
@@ -177,6 +180,7 @@ def test_only_nmt_commands_change_states_and_only_asked_nodes_answer(
             assert answer.can_id != 0x7E4 or frame.can_id == 0x7E5
 
 
+@pytest.mark.promise("pdo")
 @given(st.lists(happenings, max_size=40))
 @FEW
 def test_no_pdo_is_sent_outside_operational_and_no_emergency_when_stopped(

@@ -20,10 +20,13 @@ from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.runtime.system.machine import machine_identity, serial_number
 from kontronik_can_gw.signals.plan import Layout
 
+pytestmark = pytest.mark.promise("cia-301")
+
 VALUE = 0x06090030
 TAKEN = 0x06040043
 
 
+@pytest.mark.promise("conflicts")
 def test_an_id_conflict_is_reported_once_and_cleared_when_it_ends() -> None:
     bench = Bench(changes=QUIET)
     bench.take()
@@ -42,6 +45,7 @@ def test_an_id_conflict_is_reported_once_and_cleared_when_it_ends() -> None:
     ]
 
 
+@pytest.mark.promise("one-frame-one-time")
 def test_all_pdos_caused_by_a_uart_frame_carry_its_values() -> None:
     numbers = range(1, 5)
     speed_only = (254, 0, 0, 0x20000120)
@@ -113,6 +117,7 @@ def test_ids_of_pdos_of_all_nodes_and_of_the_dbc_cannot_be_used() -> None:
     assert bench.write(0x2101, 2, 9, size=1) is None
 
 
+@pytest.mark.promise("pdo")
 def test_each_mappable_object_can_be_sent_and_equals_its_sdo_value() -> None:
     bench = Bench(changes={**QUIET, **default(0x2100, 5, 2)})
     fields = {"electrical_speed": 66051, "battery_voltage": 2442, "bec_current": 5}
@@ -172,6 +177,7 @@ MAPPED = {0x1A0500: b"\1", 0x1A0501: u32(0x20000220)}
 EVENT_TIMERS = {(0x1800 + n) << 8 | 5: b"\1\0" for n in range(4)}
 
 
+@pytest.mark.promise("parameters")
 @pytest.mark.parametrize(
     "stored",
     [

@@ -1,5 +1,6 @@
 """The order of a node's frames, values that do not fit, node-IDs before the start, and bus load."""
 
+import pytest
 from dialogue import EMPTY, QUIET, Bench, live, tpdo
 
 from kontronik_can_gw.canopen.nodes import traffic
@@ -10,6 +11,8 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
 from kontronik_can_gw.status import UNCONFIGURED
+
+pytestmark = pytest.mark.promise("order")
 
 LINK_STATUS = LINK << 16 | 0x0108
 CRC_ERRORS = LINK << 16 | 0x0720
@@ -33,6 +36,7 @@ def test_answers_of_a_node_are_never_overtaken() -> None:
     assert waiting.take_all() == frames
 
 
+@pytest.mark.promise("parameters")
 def test_a_stored_value_that_does_not_fit_is_reported_once_at_each_reset() -> None:
     stored = Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})
     bench = Bench(changes=QUIET, stored=[stored])
@@ -55,6 +59,7 @@ def test_the_node_ids_to_lock_are_known_before_the_start() -> None:
     assert [node_id for node_id, _, _ in gateway.node_states()] == [5, 9, UNCONFIGURED]
 
 
+@pytest.mark.promise("overload")
 def test_the_bus_load_is_computed_from_the_rate_of_each_pdo() -> None:
     def rate(*mapped: int, kind: int = 255, timer: int = 0) -> float:
         bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, timer, *mapped)}).start()

@@ -19,6 +19,8 @@ from wire import Wire
 from kontronik_can_gw.canopen.dictionary import Abort
 from kontronik_can_gw.times import NEVER
 
+pytestmark = pytest.mark.promise("sdo")
+
 # ---- any traffic
 
 PLACES = [*KNOWN, (0x1000, 7), (0x3000, 0)]

@@ -20,6 +20,8 @@ from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import EscConfig
 from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, Row, rows
 
+pytestmark = pytest.mark.promise("shipped-eds")
+
 SHIPPED = Path(__file__).parents[2] / "eds" / "kontronik_esc.eds"
 DATA = SHIPPED.read_bytes()
 U8 = 0x05

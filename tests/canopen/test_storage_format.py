@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from kontronik_can_gw.canopen.storage import Stored, decode, encode
 
+pytestmark = pytest.mark.promise("parameters")
+
 SAMPLE = Stored(
     7,
     {0x101700: b"\xf4\x01", 0x140001: bytes.fromhex("81010040"), 0x1A0000: b"\0"},

@@ -7,6 +7,8 @@ from kontronik_can_gw.canopen.objects import GATEWAY
 from kontronik_can_gw.canopen.sync import MAX_WAITING
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("sync")
+
 REPLACED = (GATEWAY, 7)
 VOLTAGE = 0x20000210
 LIVE_COUNTER = 0x20200208

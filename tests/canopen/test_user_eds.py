@@ -26,6 +26,8 @@ from kontronik_can_gw.canopen.eds import EdsEntry
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
+pytestmark = pytest.mark.promise("user-eds")
+
 
 def with_object(content: str, index: int = 0x2200) -> str:
     """Return the shipped EDS with a further manufacturer object."""

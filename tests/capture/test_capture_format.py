@@ -43,6 +43,8 @@ from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("damaged-captures")
+
 entries = st.builds(
     Entry,
     st.integers(0, 2**64 - 1),

@@ -16,6 +16,8 @@ from kontronik_can_gw.runtime.files.event_recorder import EventRecorder, Ring
 from kontronik_can_gw.runtime.system.clock import ClockFacts
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("events")
+
 REMARKS = (EntryKind.LOST, EntryKind.CLOCK)
 BOTH = pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
 
@@ -358,6 +360,7 @@ def test_a_disk_that_fails_during_a_capture_begins_a_new_one(
     assert flight.it.facts.lost == 0
 
 
+@pytest.mark.promise("captures")
 def test_lost_entries_are_counted_while_the_disk_fails_for_long(tmp_path: Path) -> None:
     folder = tmp_path / "captures"
     folder.write_text("not a folder")

@@ -16,7 +16,10 @@ from kontronik_can_gw.runtime.files.event_watch import EventWatch
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS, SECOND
 
-pytestmark = pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
+pytestmark = [
+    pytest.mark.promise("events"),
+    pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True),
+]
 START = 100 * SECOND
 LIVE = LiveData(**(dict.fromkeys(LiveData._fields, 0) | {"battery_voltage": 2400}))
 INFO = InfoData(**(dict.fromkeys(InfoData._fields, 0) | {"device_and_variant": 1 << 10 | 5}))

@@ -18,6 +18,8 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY
 from kontronik_can_gw.times import END_OF_TIME
 
+pytestmark = pytest.mark.promise("damaged-captures")
+
 GOOD = {
     "escs": [{"energy": 5, "run_time": 6, "losses": 7}],
     "can_state": 1,

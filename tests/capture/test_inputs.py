@@ -28,6 +28,8 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("tables")
+
 
 def plain_run(seconds: float, faults: Faults | None = None) -> Bench:
     """Run a gateway with an ESC whose frames are read every 5 ms."""
@@ -165,6 +167,7 @@ def test_a_changed_wall_clock_applies_to_later_entries(tmp_path: Path) -> None:
     assert walls == [wall, wall + SECOND, wall + 3601 * SECOND, wall + 51 * SECOND]
 
 
+@pytest.mark.promise("damaged-captures")
 def test_missing_blocks_and_a_missing_end_of_a_capture_are_reported(tmp_path: Path) -> None:
     """Times of entries never decrease, even if the times in the file do."""
     header = made(1)[0].header() | {"run": "r", "part": 0, "created_ns": START}

@@ -13,6 +13,8 @@ from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.status import CanState
 
+pytestmark = pytest.mark.promise("recorded-calls")
+
 NOT_CALLS = {
     "not_sent": "a note about the frames of the last call",
     "take_frames": "follows from the calls that take frames",

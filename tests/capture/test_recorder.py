@@ -20,6 +20,8 @@ from kontronik_can_gw.runtime.files import recorder
 from kontronik_can_gw.runtime.files.recorder import CAPACITY, Recorder
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("captures")
+
 HEADER = made(1)[0].header()
 
 
@@ -301,6 +303,7 @@ def test_a_blocked_disk_is_reported_and_lost_entries_are_counted(
     assert begins == [False]
 
 
+@pytest.mark.promise("captures")
 def test_each_block_is_forced_to_the_disk_twice(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -8,11 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import pytest
 from capture_bench import START, Bench, capture, made
 from command_line import refused, written
 
 from kontronik_can_gw.capture.format import EntryKind
 from kontronik_can_gw.times import SECOND
+
+pytestmark = pytest.mark.promise("replay")
 
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 

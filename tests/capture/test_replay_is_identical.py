@@ -23,6 +23,8 @@ from kontronik_can_gw.capture.replay import SETTLE_NS, Replay, TimedFrame
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("replay")
+
 GATEWAY_STATUS = 0x6D8
 WITH_LOSSES = range(0x680, 0x688)
 """The messages with LinkLosses, one for each ESC."""

@@ -9,6 +9,8 @@ from rights import modes_apply
 
 from kontronik_can_gw.cli import arguments
 
+pytestmark = pytest.mark.promise("all-mistakes")
+
 LEAST = '[[esc]]\nport = "/dev/ttyUSB0"\n'
 
 

@@ -22,6 +22,8 @@ from kontronik_can_gw.cli.arguments import REMOVED_OPTIONS
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.pty import PtyEsc
 
+pytestmark = pytest.mark.promise("one-line")
+
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 Done = subprocess.CompletedProcess[str]
 
@@ -44,6 +46,7 @@ def terminal() -> Iterator[PtyEsc]:
 # --- usage
 
 
+@pytest.mark.promise("removed")
 @pytest.mark.parametrize("words", ["replay a --on=tape --to=tape", "replay -h --to tape"])
 def test_a_removed_option_is_refused_with_its_replacement(words: str) -> None:
     assert refused(2, *words.split()).startswith("--to: was removed. Type --on can or --on pty. ")
@@ -135,6 +138,7 @@ def test_a_port_without_permission_is_reported_with_the_group_to_join(
     assert ("usermod" in done.stderr) == (mode == 0o660)
 
 
+@pytest.mark.promise("one-device")
 def test_two_names_of_one_device_are_refused(tmp_path: Path, terminal: PtyEsc) -> None:
     link = tmp_path / "by-id"
     link.symlink_to(terminal.path)
@@ -220,6 +224,7 @@ def shell(command: str) -> Done:
     return subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.promise("closed-ends")
 @pytest.mark.parametrize("words", ["schema", "init -", "dbc --esc 1"])
 def test_a_full_disk_at_standard_output_is_reported_in_one_line(words: str) -> None:
     done = shell(f"PROGRAM {words} >/dev/full")
@@ -242,6 +247,7 @@ def test_a_closed_standard_output_causes_no_traceback(
 # --- advice
 
 
+@pytest.mark.promise("removed")
 def test_the_lines_that_replace_removed_options_are_accepted() -> None:
     advice = " ".join(REMOVED_OPTIONS.values())
     lines = set(
@@ -261,6 +267,7 @@ def test_the_lines_that_replace_removed_options_are_accepted() -> None:
 # --- CAN adapters
 
 
+@pytest.mark.promise("one-device")
 @pytest.mark.parametrize("words", ["mqtt --broker x", "replay x.bin --on can"])
 def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
     words: str,

@@ -16,6 +16,8 @@ from kontronik_can_gw.esc.kontronik.protocol import KONTRONIK
 from kontronik_can_gw.esc.kontronik.simulator import SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 
+pytestmark = pytest.mark.promise("simulated-esc")
+
 COMMAND = [sys.executable, "-m", "kontronik_can_gw", "simulate"]
 
 
@@ -91,6 +93,7 @@ def test_escs_on_terminals_are_listed_and_send_until_a_signal(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.promise("silent-to-esc")
 def test_a_gateway_that_transmits_to_the_esc_is_reported() -> None:
     pipe = subprocess.PIPE
     with subprocess.Popen(COMMAND, stdout=pipe, stderr=pipe, text=True) as process:

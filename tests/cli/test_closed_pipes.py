@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.promise("closed-ends")
+
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 CLOSED = 141
 NOTES = (

@@ -9,6 +9,8 @@ from command_line import run
 
 from kontronik_can_gw.cli import COMMANDS
 
+pytestmark = pytest.mark.promise("help")
+
 
 @pytest.fixture(scope="module")
 def script(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -17,6 +17,8 @@ from kontronik_can_gw.cli.common import canopen_of
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.esc.telemetry import EscSettings
 
+pytestmark = pytest.mark.promise("user-eds")
+
 EDS = shipped("eds/kontronik_esc.eds")
 Key = tuple[int, int]
 

@@ -7,6 +7,8 @@ import pytest
 from command_line import run, written
 from rights import modes_apply
 
+pytestmark = pytest.mark.promise("one-line")
+
 CONFIGURATION = (
     '[can]\ninterface = "virtual"\n[mqtt]\nbroker = "localhost"\n[[esc]]\nport = "nowhere"\n'
 )

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from command_line import run
 
+pytestmark = pytest.mark.promise("docs")
+
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 NO_CONFIGURATION = "write an example with kontronik-can-gw init"
 IN_THIS_ORDER = (

@@ -10,6 +10,8 @@ from command_line import run
 
 from kontronik_can_gw.cli import COMMANDS, FIRST_COMMANDS, make_parser
 
+pytestmark = pytest.mark.promise("help")
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

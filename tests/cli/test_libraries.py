@@ -17,6 +17,8 @@ from kontronik_can_gw.desk.libraries import (
     missing_library,
 )
 
+pytestmark = pytest.mark.promise("one-line")
+
 PROJECT = Path(__file__).resolve().parents[2]
 
 

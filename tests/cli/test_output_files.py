@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from command_line import run, written
 
+pytestmark = pytest.mark.promise("outputs-of-commands")
+
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 CONFIGURATION = '[can]\ninterface = "virtual"\n[dbc]\nfile = "own.dbc"\n[[esc]]\nport = "x"\n'
 COMMANDS = (

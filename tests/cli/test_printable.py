@@ -20,6 +20,8 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.printable import printable, printable_json
 from kontronik_can_gw.runtime.system.fault_log import BackgroundHandler
 
+pytestmark = pytest.mark.promise("printable")
+
 EVIL = "a\x1b]0;x\x07\x9b31m\u202eb\u2066\x7f\r\nINFO fake"
 SHOWN = "a?]0;x??31m?b????INFO fake"
 DBC = shipped("dbc/kontronik_esc.dbc").read_text("utf-8")

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.promise("one-line")
+
 SEED = 41
 COUNT = 2000
 PARTS = 8

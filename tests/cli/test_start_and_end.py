@@ -16,6 +16,8 @@ import pytest
 
 from kontronik_can_gw import cli
 
+pytestmark = pytest.mark.promise("closed-ends")
+
 LIMITED = 'ulimit -n "$0" && exec "$@"'
 INTERRUPTED = """
 import os, runpy, signal, sys

@@ -26,6 +26,8 @@ from kontronik_can_gw.config.parse import load, parse
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.times import MS
 
+pytestmark = pytest.mark.promise("all-mistakes")
+
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
 KEYS: dict[str, dict[str, Any]] = {}
 for _table, _described in schema()["properties"].items():
@@ -246,6 +248,7 @@ def rows_of(table: dict[str, Any]) -> str:
 # --- keys of earlier versions
 
 
+@pytest.mark.promise("removed")
 def test_removed_key_is_a_warning_with_place_and_replacement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -283,6 +286,7 @@ def uncommented() -> str:
     return re.sub(commented, "", EXAMPLE.read_text(encoding="utf-8"))
 
 
+@pytest.mark.promise("schema")
 def test_shipped_example_is_valid_and_has_every_key(tmp_path: Path) -> None:
     assert load(EXAMPLE).esc[0].pole_pairs == 7
     text = uncommented()
@@ -311,6 +315,7 @@ def accepted(made: Any) -> Config | None:
         return None
 
 
+@pytest.mark.promise("schema")
 def test_schema_describes_every_key_with_the_default_of_the_parser() -> None:
     jsonschema.Draft202012Validator.check_schema(schema())
     config = parse(tables(), "folder/a.toml")
@@ -388,6 +393,7 @@ def given(table: str, key: str) -> list[tuple[bool | None, Any]]:
     return found
 
 
+@pytest.mark.promise("schema")
 def test_schema_and_parser_accept_the_same_and_toml_is_equal() -> None:
     """A schema cannot express the range of a gear as text, or ambiguous names."""
     for table, keys in KEYS.items():

@@ -11,6 +11,8 @@ from kontronik_can_gw.desk.conformance.run import ItemVerdict, all_items, run
 from kontronik_can_gw.desk.conformance.slave import Slave
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("conformance")
+
 _TPDOS_EMCY_AND_LSS = (0x081, 0x181, 0x7E4)
 
 

@@ -20,6 +20,8 @@ from kontronik_can_gw.cli import COMMANDS
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.conformance.run import all_items
 
+pytestmark = pytest.mark.promise("conformance")
+
 EDS = str(shipped("eds/kontronik_esc.eds"))
 MUST_FAIL = {
     "nmt-boot-up-after-reset-node",

@@ -13,6 +13,8 @@ from kontronik_can_gw.canopen.eds import load
 from kontronik_can_gw.desk.conformance.eds_file import EdsFile, read_eds
 from kontronik_can_gw.desk.conformance.run import chosen_items, run
 
+pytestmark = pytest.mark.promise("conformance")
+
 _DUMMIES = "".join(f"Dummy{index:04d}={int(index > 1)}\n" for index in range(1, 8))
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from test_kuksa_example import OVERLAY, SENSORS, UNITS_OF_VSS, sensors
 
+pytestmark = pytest.mark.promise("docs")
+
 
 @pytest.mark.parametrize("celsius", ["celsius", "Celsius"])
 def test_vss_tools_accept_the_overlay(celsius: str, tmp_path: Path) -> None:

@@ -23,6 +23,8 @@ from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS
 
+pytestmark = pytest.mark.promise("binding")
+
 LIVE = LiveData(
     electrical_speed=70_000,
     battery_voltage=4442,
@@ -150,6 +152,7 @@ def test_a_float_beyond_its_limits_is_nan(maximum: str, is_sent: bool) -> None:
         assert math.isnan(number)
 
 
+@pytest.mark.promise("codes")
 @pytest.mark.parametrize(
     "text", ["NotAvailable", "SNA", "sna", "N_A", "SignalNotAvailable", "not_available"]
 )
@@ -158,6 +161,7 @@ def test_the_code_for_not_available_is_found_by_its_usual_names(text: str) -> No
     assert raw_of(signal) == 9
 
 
+@pytest.mark.promise("codes")
 @pytest.mark.parametrize("text", ["Error", "ERR", "Invalid"])
 def test_the_code_for_an_error_is_found_by_its_usual_names(text: str) -> None:
     signal = Sig("BatteryVoltage", 0, 8, unit="mV", texts={9: text})
@@ -177,6 +181,7 @@ def test_a_counter_restarts_at_0_before_the_first_code(first_code: int, sent: li
     assert read == sent
 
 
+@pytest.mark.promise("e2e")
 def test_an_alive_counter_restarts_at_0_before_the_first_code() -> None:
     signal = Sig("MessageCounter", 0, 4, texts={14: "Error", 5: "NotAvailable"})
     (plan,) = layout_of([Msg("M", 0x100, 1, [signal])]).messages
@@ -190,6 +195,7 @@ def test_a_further_code_between_the_values_is_refused(texts: dict[int, str]) -> 
     assert "further code" in line
 
 
+@pytest.mark.promise("codes")
 def test_a_further_code_at_the_end_of_the_range_is_no_value() -> None:
     texts = {65535: "SNA", 65534: "Error", 65533: "Invalid"}
     (plan,) = layout_of([Msg("M", 0x100, 8, [Sig("PwmInput", 0, 16, texts=texts)])]).messages

@@ -9,6 +9,8 @@ from kontronik_can_gw.dbc.bounds import MAX_BYTES
 from kontronik_can_gw.dbc.reader import load_database, parse_database
 from kontronik_can_gw.errors import UserError
 
+pytestmark = pytest.mark.promise("dbc-bounds")
+
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n'
 ONE = 'BO_ 1 Msg: 8 A\n SG_ s : 0|8@1+ (1,0) [0|0] "" A\n'
 IN_ALL = "total number of multiplexer values is"

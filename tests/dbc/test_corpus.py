@@ -26,6 +26,8 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout, SignalPlan
 from kontronik_can_gw.signals.units import conversion, says_nothing
 
+pytestmark = pytest.mark.promise("dbc-as-it-is")
+
 opendbc = pytest.importorskip(
     "opendbc", reason="opendbc refuses Python 3.13: run it by an older one"
 )

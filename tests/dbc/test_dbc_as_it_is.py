@@ -29,6 +29,8 @@ from kontronik_can_gw.signals.plan import SEND_TYPES, Layout, Role, SendType
 from kontronik_can_gw.signals.units import conversion
 from kontronik_can_gw.times import MS
 
+pytestmark = pytest.mark.promise("dbc-as-it-is")
+
 
 def signal(
     name: str,
@@ -136,6 +138,7 @@ for _unit, _rows in UNITS.items():
     SPELLED += [(_unit, *row) for row in _rows]
 
 
+@pytest.mark.promise("units")
 @pytest.mark.parametrize(("unit", "texts", "factor", "shift"), SPELLED)
 def test_a_unit_is_recognised_in_each_of_its_spellings(
     unit: str,
@@ -150,6 +153,7 @@ def test_a_unit_is_recognised_in_each_of_its_spellings(
         assert float(found[1]) == pytest.approx(float(Fraction(shift)), rel=1e-11), text
 
 
+@pytest.mark.promise("units")
 def test_a_unit_of_another_quantity_or_of_two_meanings_is_refused() -> None:
     """The lines of refusal, with the units that are possible, are in the golden set."""
     others = {

@@ -36,6 +36,8 @@ from kontronik_can_gw.signals.e2e import PROFILES, DataIdMode, Profile, Protecti
 from kontronik_can_gw.signals.plan import Layout, Role
 from kontronik_can_gw.times import MS
 
+pytestmark = pytest.mark.promise("e2e")
+
 FIRST_16 = tuple(range(1, 17))
 """The list of data ids in the examples of the specification."""
 

@@ -25,6 +25,8 @@ from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout, MessagePlan
 
+pytestmark = pytest.mark.promise("expansion")
+
 SHIPPED = shipped("dbc/kontronik_esc.dbc").read_text()
 RICH = Path(__file__).with_name("rich.dbc").read_text()
 

@@ -17,6 +17,8 @@ from cantools.database.namedsignalvalue import NamedSignalValue
 
 from kontronik_can_gw.config.keys import shipped
 
+pytestmark = pytest.mark.promise("docs")
+
 FOLDER = Path(__file__).resolve().parents[2] / "examples/kuksa"
 SCHEMA = Path(__file__).with_name("kuksa_mapping.schema.json")
 MAPPING = json.loads((FOLDER / "vss_dbc.json").read_text())

@@ -15,6 +15,8 @@ from kontronik_can_gw.dbc.prepare import check_load
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.signals.plan import Layout
 
+pytestmark = pytest.mark.promise("packing")
+
 PAGE = Sig("Page", 0, 8, mux="M")
 VOLTAGE = Sig("BatteryVoltage", 0, 16, factor="0.01", unit="V")
 
@@ -206,6 +208,7 @@ def test_the_worst_load_counts_each_change(
     assert worst == pytest.approx(frames_a_second * 135e-6, rel=1e-12)
 
 
+@pytest.mark.promise("overload")
 def test_the_worst_load_causes_a_warning_and_the_usual_load_a_refusal() -> None:
     message = message_of("LeftBatteryVoltage")
     layout = layout_of(message, CYCLIC_AND_ON_CHANGE, 20)

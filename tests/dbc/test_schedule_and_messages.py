@@ -21,6 +21,8 @@ from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("schedule")
+
 CYCLIC, EVENT, ON_CHANGE, CYCLIC_AND_EVENT, CYCLIC_AND_ON_CHANGE = range(5)
 TIMEOUT = 250 * MS
 VOLTAGE = Sig("BatteryVoltage", 0, 16, unit="V", factor="0.01")
@@ -287,6 +289,7 @@ def test_scene_sends_these_values_at_these_times(scene: Scene) -> None:
 # --- one step
 
 
+@pytest.mark.promise("order")
 def test_due_messages_are_sent_by_due_time_and_then_by_index() -> None:
     ids = {
         0x100: (EVENT, 0),
@@ -392,6 +395,7 @@ def test_silent_sends_a_message_of_several_escs_while_one_is_up() -> None:
     assert bench.times()[-1] == 650
 
 
+@pytest.mark.promise("one-frame-one-time")
 def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
     signals = [
         replace(VOLTAGE, name="LeftBatteryVoltage"),
@@ -435,6 +439,7 @@ NOTHING = {1: 0xFFFF, 5: 0x80, 9: 0x80}
 """Codes for "not available", by page."""
 
 
+@pytest.mark.promise("true")
 @pytest.mark.parametrize("kind", [EVENT, ON_CHANGE])
 @pytest.mark.parametrize("delay", [0, 30])
 def test_after_a_loss_each_page_is_sent_as_not_available(kind: int, delay: int) -> None:

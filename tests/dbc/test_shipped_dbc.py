@@ -20,6 +20,8 @@ from dbc_bench import check_comments
 from packer_oracle import get, pascal, put
 from specification.quantities import CAN_STATES, GATEWAY_STATES, LAYOUTS, LINKS
 
+pytestmark = pytest.mark.promise("shipped-dbc")
+
 FILES = sorted((Path(__file__).parents[2] / "dbc").glob("*.dbc"))
 SHIPPED = next(file for file in FILES if file.stem == "kontronik_esc")
 FRAMES_PER_MESSAGE = 100

@@ -23,6 +23,8 @@ import pytest
 
 from kontronik_can_gw.config.keys import REMOVED_KEYS
 
+pytestmark = pytest.mark.promise("packages")
+
 HERE = Path(__file__).resolve().parent
 PROJECT = make_deb.PROJECT
 CACHE = HERE / ".cache"

@@ -31,6 +31,8 @@ from sbom import licence_of
 
 from kontronik_can_gw.cli.service import PLAIN, planned
 
+pytestmark = pytest.mark.promise("packages")
+
 PROJECT = make_deb.PROJECT
 LEFT_OUT = {"wrapt", "markdown-it-py", "pygments", "argparse-addons", "crccheck"}
 """Dependencies of libraries that no command of ours imports."""

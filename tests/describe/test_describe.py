@@ -28,6 +28,8 @@ from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.status import CanState, GatewayState
 
+pytestmark = pytest.mark.promise("descriptions")
+
 Facts = dict[str, Any]
 DBC = shipped("dbc/kontronik_esc.dbc")
 EDS = shipped("eds/kontronik_esc.eds")

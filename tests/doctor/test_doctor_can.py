@@ -14,6 +14,8 @@ from doctor_trees import Tree, grave, only
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.doctor.can import check_can
 
+pytestmark = pytest.mark.promise("doctor")
+
 OK = "ok"
 NOTE = "note"
 WARNING = "warning"

@@ -10,6 +10,8 @@ from kontronik_can_gw.desk.doctor.clock import check_clock
 from kontronik_can_gw.desk.doctor.machine import Machine
 from kontronik_can_gw.runtime.system.clock import ClockFacts
 
+pytestmark = pytest.mark.promise("doctor", "clock")
+
 
 def findings(tree: Tree) -> list[Finding]:
     found = Findings("Machine")

@@ -17,6 +17,8 @@ from kontronik_can_gw.desk.doctor import ports
 from kontronik_can_gw.desk.pty import PtyEsc
 from kontronik_can_gw.runtime.status.facts import PortFacts, program_facts
 
+pytestmark = pytest.mark.promise("doctor")
+
 
 @pytest.fixture
 def esc() -> Iterator[PtyEsc]:

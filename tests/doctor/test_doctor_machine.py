@@ -16,6 +16,8 @@ from kontronik_can_gw.desk.doctor.service import (
     unit_of,
 )
 
+pytestmark = pytest.mark.promise("doctor")
+
 CONFIG = "/etc/kontronik-can-gw/gateway.toml"
 STORE = "/var/lib/kontronik-can-gw"
 OK = "ok"

@@ -10,6 +10,8 @@ from doctor_trees import Tree, grave, only
 
 from kontronik_can_gw.desk.doctor.ports import check_port
 
+pytestmark = pytest.mark.promise("doctor")
+
 OK = "ok"
 NOTE = "note"
 WARNING = "warning"

@@ -42,6 +42,8 @@ from kontronik_can_gw.desk.parcel.parts import Contents, add_journal
 from kontronik_can_gw.desk.parcel.secrets import Cleaner
 from kontronik_can_gw.desk.recordings.inputs import open_input
 
+pytestmark = pytest.mark.promise("support-bundle")
+
 SECRETS = ("hunter2", "c0rrect h0rse", "t0k3n", "c0mment", "s3ed", "p1ace", "acc3ss", "pl4nt")
 CONFIGURATION = """# the broker's password: hunter2 (c0mment)
 [can]

@@ -15,6 +15,8 @@ from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.desk.parcel.files import clean_dbc, clean_eds, clean_toml
 from kontronik_can_gw.desk.parcel.secrets import REMOVED, Cleaner, is_secret_name
 
+pytestmark = pytest.mark.promise("support-bundle")
+
 PROJECT = Path(__file__).resolve().parents[2]
 KEY = "2b7e151628aed2a6abf7158809cf4f3c"
 IN_BYTES = " ".join(f"{byte:02X}" for byte in bytes.fromhex(KEY))

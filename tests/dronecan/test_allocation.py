@@ -12,6 +12,8 @@ from dronecan_bench import Bench, dronecan, peers_frames
 
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("allocation")
+
 Allocation = dronecan.uavcan.protocol.dynamic_node_id.Allocation
 
 

@@ -14,6 +14,8 @@ from dronecan_bench import LIVE, Bench, Transfer
 
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("dronecan")
+
 TIMEOUT = 250 * MS
 """Time after which the gateway's value of an ESC is not available (telemetry_timeout_ms)."""
 RPM_LIFE = SECOND

@@ -15,7 +15,10 @@ from foreign_tools import PACKAGES, need
 READER = PACKAGES / "dronecan_reader" / "release" / "dronecan-reader"
 protocol = dronecan_bench.dronecan.uavcan.protocol
 
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("dronecan"),
+    pytest.mark.extended,
+]
 
 
 def test_the_crate_reads_the_same_transfers_as_the_package() -> None:

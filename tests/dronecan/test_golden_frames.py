@@ -28,6 +28,8 @@ from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.signals.transfer import transfer
 
+pytestmark = pytest.mark.promise("dronecan")
+
 protocol = dronecan.uavcan.protocol
 UNIQUE_ID = bytes(range(1, 17))
 

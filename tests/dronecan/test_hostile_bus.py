@@ -14,6 +14,8 @@ from kontronik_can_gw.dronecan.wire import MAX_PAYLOAD, MAX_TRANSFERS
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.times import MS
 
+pytestmark = pytest.mark.promise("unstoppable")
+
 
 def frame(rng: random.Random, node_ids: list[int]) -> CanFrame:
     """Return a random frame. Half of the frames look as if they are for us."""

@@ -21,6 +21,8 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("dronecan")
+
 ON = {"enabled": True, "node_id": 42, "per_esc_nodes": True, "extended_hz": 7}
 TOML = """
 [can]

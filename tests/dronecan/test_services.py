@@ -8,6 +8,8 @@ from dronecan_bench import Bench, dronecan, loaded, peers_frames
 from kontronik_can_gw.dronecan.nodes import MAX_ANSWERS
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 
+pytestmark = pytest.mark.promise("dronecan-services")
+
 protocol = dronecan.uavcan.protocol
 GetSet = protocol.param.GetSet
 
@@ -126,6 +128,7 @@ def test_frames_that_are_no_request_to_us_are_not_answered(frame: CanFrame) -> N
     assert bench.ask(GetSet.Request(index=0)) is not None
 
 
+@pytest.mark.promise("conflicts")
 def test_another_device_with_our_node_id_is_reported_and_sending_continues() -> None:
     bench = Bench(2, per_esc_nodes=True, canopen=True, dbc=True).run(0.5)
     taken = bench.gateway.conflicts.take

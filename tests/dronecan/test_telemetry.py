@@ -12,6 +12,8 @@ from kontronik_can_gw.native import load
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("dronecan")
+
 HOT = OperatingError.POWER_STAGE_OVERTEMP_ERROR
 WARM = OperatingError.POWER_STAGE_OVERTEMP_WARNING
 HOT_NOW = LIVE._replace(operating_errors=1 << HOT)
@@ -219,6 +221,7 @@ def test_transfer_ids_count_from_0_to_31_for_each_message_of_a_node(
     assert texts == list(range(len(texts))) != []
 
 
+@pytest.mark.promise("late-frames")
 def test_values_that_waited_in_a_hold_up_are_not_sent() -> None:
     """No frame is sent later in place of a missed one, and only fresh values are sent."""
     bench = Bench().run(1)

@@ -10,6 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytestmark = pytest.mark.promise("one-place")
+
 PACKAGE = Path(__file__).resolve().parents[2] / "kontronik_can_gw"
 FIRST = "    electrical_speed: ElectricalSpeed = 0\n"
 SHOW = """

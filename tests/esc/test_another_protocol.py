@@ -37,6 +37,8 @@ from kontronik_can_gw.times import SECOND
 
 from .kiss import KISS, frame
 
+pytestmark = pytest.mark.promise("another-protocol")
+
 DBC = Path(__file__).with_name("kiss.dbc")
 PERIOD = SECOND // 10
 MIXED: dict[str, Any] = {

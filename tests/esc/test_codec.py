@@ -28,6 +28,8 @@ from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from . import reference
 from .streams import form_of
 
+pytestmark = pytest.mark.promise("fields")
+
 RECORDED: dict[bytes, LiveData | InfoData] = {
     specification.RECORDED_LIVE: LiveData(
         battery_voltage=2442,
@@ -101,6 +103,7 @@ def test_raw_values_survive_a_round_trip_with_any_reserved_bytes(
     assert frame_in(other).data == frame_in(sent).data == data
 
 
+@pytest.mark.promise("layouts")
 @pytest.mark.parametrize(
     ("frame", "offset", "name"),
     [

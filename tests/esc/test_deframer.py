@@ -21,6 +21,8 @@ from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from .reference import certain_at, counters_of, form_row, frames_of
 from .streams import random_chunks, seeds, streams
 
+pytestmark = pytest.mark.promise("brute-force")
+
 PROPERTY = settings(deadline=None, max_examples=100, database=None)
 
 
@@ -259,6 +261,7 @@ BEFORE = (
 )
 
 
+@pytest.mark.promise("esc-diagnosis")
 @pytest.mark.parametrize(("expected", "received"), DIAGNOSES)
 def test_bytes_without_a_frame_have_a_diagnosis(expected: str, received: list[bytes]) -> None:
     for before, stream in product(BEFORE, received):
@@ -273,6 +276,7 @@ def test_bytes_without_a_frame_have_a_diagnosis(expected: str, received: list[by
         assert str(deframer.counters.diagnosis(since)).startswith(expected)
 
 
+@pytest.mark.promise("layouts")
 def test_live_frames_whose_crc_covers_34_bytes_are_counted_and_not_accepted() -> None:
     """One other receiver takes them. No recording is public."""
     deframer = Deframer()

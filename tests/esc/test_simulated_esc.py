@@ -28,6 +28,8 @@ from kontronik_can_gw.esc.kontronik.states import (
     SelfTestError,
 )
 
+pytestmark = pytest.mark.promise("simulated-esc")
+
 S = 1_000_000_000
 
 

@@ -21,6 +21,8 @@ from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, EscSettings, Event, LinkState
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("ages")
+
 NS_PER_BYTE = KONTRONIK.byte_ns
 
 TIMEOUT = 250 * MS
@@ -91,6 +93,7 @@ def stream(
 # --- link states
 
 
+@pytest.mark.promise("link-state")
 @pytest.mark.parametrize(
     ("broken", "noise", "state"),
     [
@@ -115,6 +118,7 @@ def test_bad_second_degrades_the_link_and_clean_second_restores_it(
     assert link == LinkState.OK
 
 
+@pytest.mark.promise("link-state")
 @pytest.mark.parametrize("seen", [False, True])
 def test_lost_port_is_an_error_until_it_is_reopened(seen: bool) -> None:
     """Bytes from before and after the loss do not form a frame."""
@@ -259,6 +263,7 @@ def test_info_frame_is_late_after_its_own_time_out() -> None:
 # --- derived values
 
 
+@pytest.mark.promise("round-once")
 def test_energy_and_run_time_agree_with_an_independent_integration() -> None:
     telemetry = esc()
     watt_seconds = 0.0

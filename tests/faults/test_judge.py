@@ -9,6 +9,8 @@ from feeder import CURRENT, SPEED, FedEsc, Identity, live, mix
 
 from kontronik_can_gw.esc.kontronik.codec import WireLayout
 
+pytestmark = pytest.mark.promise("sharp-tests")
+
 START = 100 * SECOND
 PERIOD = 20 * MS
 SPEED_ID = 0x688

@@ -15,6 +15,8 @@ from memory_slope import HOUR_S, Sample, faults_in, slope_kib_per_hour
 from programme import PROJECT, conclude, main
 from qemu_adapter import SerialAdapter
 
+pytestmark = pytest.mark.promise("unstoppable")
+
 
 def row(
     name: str = "x",

@@ -25,6 +25,8 @@ from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import NmtState
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("outputs")
+
 FIRST_ID = 0x1234500
 COMMAND_ID = 0x12
 ESCS = [EscSettings("left"), EscSettings("right")]

@@ -32,6 +32,8 @@ from kontronik_can_gw.gateway.gate_table import (
 )
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
+pytestmark = pytest.mark.promise("gate")
+
 TIMEOUT = 200 * MS
 RESTART_AFTER = SECOND // 2
 MOST_STATES = int(os.environ.get("KCG_GATE_STATES", "2500"))
@@ -205,6 +207,7 @@ def recover(gate: Gate, now: int) -> int:
     return now - begin
 
 
+@pytest.mark.promise("unstoppable")
 def test_all_states_that_can_be_reached_keep_the_invariants(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
+import pytest
+
 from kontronik_can_gw.gateway.gate_table import TABLE, If, State
+
+pytestmark = pytest.mark.promise("gate")
 
 DESIGN = Path(__file__).parents[2] / "docs" / "design.md"
 HEAD = ["| state | event | condition | next state | acts |", "|---|---|---|---|---|"]

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from kontronik_can_gw.assembly.assemble import Loaded, assemble
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.dronecan import wire
@@ -12,6 +14,8 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import MS, NEVER, SECOND
+
+pytestmark = pytest.mark.promise("quiet-mode")
 
 QUIET_AFTER = 5 * SECOND
 LIVE = codec.encode(LiveData(battery_voltage=2400, operating_state=12), codec.WireLayout.V4)

@@ -13,6 +13,8 @@ from kontronik_can_gw.esc.telemetry import INFO_TIMEOUT_NS, EscSettings, LinkSta
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("true")
+
 EVENT = 'BA_ "GenMsgSendType" BO_ 256 1;\n'
 ON_CHANGE = 'BA_ "GenMsgSendType" BO_ 256 2;\n'
 PERIOD = 10 * MS
@@ -122,6 +124,7 @@ def test_counters_without_a_cycle_do_not_go_stale(kind: str, name: str, per_seco
     assert 3 * per_second <= int.from_bytes(sent[-1][:4], "little") <= 5 * per_second
 
 
+@pytest.mark.promise("link-state")
 def test_each_loss_of_telemetry_counts_once_whatever_its_cause() -> None:
     bench = Bench(SPEED)
     esc = bench.gateway.escs[0]

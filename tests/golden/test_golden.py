@@ -10,6 +10,8 @@ import judge
 import pytest
 import record
 
+pytestmark = pytest.mark.promise("golden")
+
 HERE = record.HERE
 
 
@@ -41,6 +43,7 @@ def unchanged(file: Path) -> None:
     assert not found, "\n".join([*found, advice])
 
 
+@pytest.mark.promise("true")
 @pytest.mark.parametrize("file", judge.files(), ids=named)
 def test_recorded_values_are_right(file: Path) -> None:
     found = judge.judge(file)

@@ -13,6 +13,8 @@ import record
 import specification
 from esc import reference
 
+pytestmark = pytest.mark.promise("tables")
+
 FLIGHTS = ("v4", "legacy", "damage", "wreckage", "swap", "extremes", "errors")
 """Flights of one ESC. Plain bytes have no times, so nothing in them becomes too old."""
 NOT_COMPARED = "bec_current"

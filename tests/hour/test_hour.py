@@ -12,7 +12,10 @@ import pytest
 from hour_programme import LOGS, Step, Verdict, steps_of
 from hour_truth import Truth
 
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("tables"),
+    pytest.mark.extended,
+]
 
 
 class Minute:

@@ -14,6 +14,8 @@ from kontronik_can_gw.desk.live.access import Address, cache_folder
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.times import SECOND as S
 
+pytestmark = pytest.mark.promise("live-access")
+
 TOKEN = "a-token-of-the-test"
 
 

@@ -13,6 +13,8 @@ from kontronik_can_gw.esc.kontronik.simulator import EscOptions
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.times import SECOND as S
 
+pytestmark = pytest.mark.promise("live-page")
+
 
 def content_of(names: list[str], seconds: float, **options: Any) -> Content:
     content = Content(FedBus(names))

@@ -22,6 +22,8 @@ from kontronik_can_gw.desk.live.flights import Flights, recordings_in
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.report.recorded import flight_of
 
+pytestmark = pytest.mark.promise("live-page")
+
 DAMAGED = Path(__file__).parents[1] / "golden/captures/damaged.kcap"
 ASK = {"X_Kontronik_Page": "1"}
 

@@ -17,7 +17,10 @@ from live_bench import wait_until
 from simulated_bus import flight, layout_of, write_log
 from vcan_tools import PROGRAM
 
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("live-access"),
+    pytest.mark.extended,
+]
 
 COUNT = 20_000
 SLOW = 200

@@ -18,7 +18,11 @@ from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.times import SECOND as S
 
-pytestmark = [pytest.mark.extended, pytest.mark.skipif(PROGRAM is None, reason=MISSING)]
+pytestmark = [
+    pytest.mark.promise("live-page"),
+    pytest.mark.extended,
+    pytest.mark.skipif(PROGRAM is None, reason=MISSING),
+]
 
 READY = "!!(globalThis.live && live.layout() && live.updates > 1)"
 # Return the text and class of each figure of an ESC's card, by source.

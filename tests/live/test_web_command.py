@@ -13,6 +13,8 @@ from vcan_tools import PROGRAM
 
 from kontronik_can_gw.desk.live.access import Address, cache_folder
 
+pytestmark = pytest.mark.promise("live-access")
+
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:

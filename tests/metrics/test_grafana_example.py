@@ -36,7 +36,10 @@ EXPRESSIONS = {
     for target in panel["targets"]
 }
 ALARMS = {rule["alert"]: rule["expr"] for rule in RULES}
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("metrics", "docs"),
+    pytest.mark.extended,
+]
 
 
 class Prometheus:

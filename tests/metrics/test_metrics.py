@@ -37,6 +37,8 @@ from kontronik_can_gw.runtime.status.facts import CanFacts, PortFacts, StoreFact
 from kontronik_can_gw.runtime.status.snapshot import STALE_NS
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("metrics")
+
 PROMTOOL = shutil.which("promtool")
 
 

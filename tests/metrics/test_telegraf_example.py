@@ -4,11 +4,14 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import pytest
 from statistics_bench import Bench
 
 from kontronik_can_gw.cli.metrics import OPTIONS
 from kontronik_can_gw.desk.metrics import families
 from kontronik_can_gw.runtime.system.clock import ClockFacts
+
+pytestmark = pytest.mark.promise("metrics", "docs")
 
 FILE = Path(__file__).parents[2] / "examples/telegraf/telegraf.conf"
 CONFIGURATION: dict[str, Any] = tomllib.loads(FILE.read_text())

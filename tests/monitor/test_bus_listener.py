@@ -12,6 +12,8 @@ from kontronik_can_gw.runtime.can import bus_listener
 from kontronik_can_gw.runtime.can.bus_listener import BusListener
 from kontronik_can_gw.status import CanState
 
+pytestmark = pytest.mark.promise("monitor")
+
 FRAME = CanFrame(0x123, b"\x01\x02")
 
 

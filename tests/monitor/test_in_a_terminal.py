@@ -16,6 +16,7 @@ from simulated_bus import flight, layout_of, with_errors, write_log
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 
 pytestmark = [
+    pytest.mark.promise("monitor"),
     pytest.mark.extended,
     pytest.mark.skipif(shutil.which("tmux") is None, reason="apt-get install tmux"),
 ]

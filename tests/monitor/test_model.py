@@ -23,6 +23,8 @@ from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("monitor")
+
 ONE = layout_of(["esc1"])
 TWO = layout_of(["left", "right"])
 

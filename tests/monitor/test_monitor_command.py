@@ -29,6 +29,8 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, SimulatedEsc
 from kontronik_can_gw.runtime.can import bus_listener
 
+pytestmark = pytest.mark.promise("monitor")
+
 DBC = shipped("dbc/kontronik_esc.dbc")
 ONE = layout_of(["esc1"])
 

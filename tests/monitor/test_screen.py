@@ -24,6 +24,8 @@ from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions
 from kontronik_can_gw.esc.kontronik.states import Device, OperatingError
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("monitor")
+
 
 def source_of(monitor: Monitor, name: str = "can0", problem: str = "") -> Source:
     made = Source(name, bus_of(len(monitor.escs)))

@@ -11,6 +11,8 @@ from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.desk.mqtt import client as mqtt_client
 from kontronik_can_gw.desk.mqtt.client import MqttClient
 
+pytestmark = pytest.mark.promise("mqtt")
+
 PATIENCE = 60.0
 CONNACK = b"\x20\x02\x00\x00"
 PUBLISH_QOS_2 = b"\x34\x07\x00\x03a/b"

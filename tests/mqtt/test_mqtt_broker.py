@@ -31,6 +31,7 @@ from kontronik_can_gw.desk.mqtt.messages import Publication
 
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin:/sbin")
 pytestmark = [
+    pytest.mark.promise("mqtt"),
     pytest.mark.extended,
     pytest.mark.skipif(MOSQUITTO is None, reason="sudo apt-get install mosquitto"),
 ]

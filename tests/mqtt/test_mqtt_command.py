@@ -7,6 +7,8 @@ from typing import NoReturn
 import pytest
 from command_line import refused, run, written
 
+pytestmark = pytest.mark.promise("mqtt")
+
 HERE = "broker = '127.0.0.1:1'\n"
 
 

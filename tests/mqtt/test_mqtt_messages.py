@@ -32,6 +32,8 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
 from kontronik_can_gw.signals.unpacker import SignalReader
 
+pytestmark = pytest.mark.promise("mqtt")
+
 TOPICS = Topics("fleet", "boat")
 MS = 1_000_000
 OWN_KEYS = {

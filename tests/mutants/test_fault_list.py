@@ -8,6 +8,8 @@ import put_in_faults
 import pytest
 from put_in_faults import PROJECT, Fault, faults
 
+pytestmark = pytest.mark.promise("sharp-tests")
+
 
 @pytest.mark.parametrize("fault", faults(), ids=lambda fault: fault.what)
 def test_each_fault_of_the_list_can_be_put_in(fault: Fault) -> None:

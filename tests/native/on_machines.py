@@ -14,6 +14,8 @@ from firmware import SOURCES, Case
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 
+pytestmark = pytest.mark.promise("firmware")
+
 HERE = Path(__file__).parent
 FIVE = HERE.parent / "benchmarks" / "five.dbc"
 CORTEX_M4 = ("-mcpu=cortex-m4", "-mthumb", "-Os", "-ffunction-sections", "-fdata-sections")

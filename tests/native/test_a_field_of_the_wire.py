@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from built import STRICT
 
+pytestmark = pytest.mark.promise("one-place")
+
 PACKAGE = Path(__file__).resolve().parents[2] / "kontronik_can_gw"
 FIRST_OF_LIVE = "    electrical_speed: ElectricalSpeed = 0\n"
 LAST_OF_INFO = "    max_bec_temperature: Temperature = 0\n"

@@ -37,6 +37,8 @@ from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.signals.plan import Layout, SendType
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("both-cores")
+
 SEEDS = 16
 
 
@@ -414,6 +416,7 @@ def test_clang_compiles_every_source_without_a_warning(tmp_path: Path) -> None:
     built(tmp_path / "core.so", *STRICT, "-O2", *OPTIONS, program="clang")
 
 
+@pytest.mark.promise("no-undefined-behaviour")
 @pytest.mark.extended
 @pytest.mark.usefixtures("c_compiler")
 def test_the_core_stays_in_its_memory_and_has_no_undefined_behaviour(tmp_path: Path) -> None:

@@ -20,6 +20,8 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.native.export_c import exported
 
+pytestmark = pytest.mark.promise("firmware")
+
 
 @pytest.mark.parametrize("seed", range(4))
 def test_an_export_sends_the_frames_of_the_python_core(

@@ -20,7 +20,10 @@ SEED = random.Random().randrange(1 << 30) if SECONDS > 30 else 1
 HERE = Path(__file__).parent
 FUZZED = (1, 2, 5)
 """Seeds of the layouts."""
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("no-undefined-behaviour"),
+    pytest.mark.extended,
+]
 
 
 @pytest.mark.parametrize("layout", FUZZED)

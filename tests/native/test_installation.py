@@ -19,7 +19,10 @@ FILES = "pyproject.toml", "hatch_build.py", "README.md", "LICENSE"
 FOLDERS = "dbc", "eds", "kontronik_can_gw"
 CONFIG = '[can]\ninterface = "virtual"\nchannel = "x"\n[[esc]]\nport = "/dev/no-port"\n'
 
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("which-core"),
+    pytest.mark.extended,
+]
 
 
 @pytest.fixture

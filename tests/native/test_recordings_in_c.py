@@ -12,6 +12,8 @@ from kontronik_can_gw.desk.recordings import bytes_input
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.recording import PlayedBlock
 
+pytestmark = pytest.mark.promise("both-cores")
+
 
 @pytest.fixture(autouse=True)
 def reads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,8 @@ import pytest
 
 from kontronik_can_gw.native.simplest import Steps, round_alike, simplest
 
+pytestmark = pytest.mark.promise("round-once")
+
 
 def _results(slope: Fraction, intercept: Fraction, steps: Steps) -> list[int]:
     return [(slope * x + intercept).__floor__() for x in range(steps.low, steps.high + 1)]

@@ -55,7 +55,10 @@ def _nodes(escs: Sequence[EscSettings]) -> CanopenSetup:
 
 ESCS = (EscSettings("esc1"),)
 EVENT = 'BA_DEF_DEF_ "GenMsgSendType" "Event";\n'
-pytestmark = pytest.mark.parametrize("core_language", ["C"], indirect=True)
+pytestmark = [
+    pytest.mark.promise("both-cores"),
+    pytest.mark.parametrize("core_language", ["C"], indirect=True),
+]
 
 
 class InC:
@@ -443,6 +446,7 @@ def test_each_change_of_the_ports_leaves_one_epoll_open(monkeypatch: pytest.Monk
     assert opened.value == before
 
 
+@pytest.mark.promise("no-undefined-behaviour")
 @pytest.mark.extended
 def test_turns_and_hold_ups_have_no_memory_error_or_undefined_behaviour(
     tmp_path: Path,
@@ -470,6 +474,7 @@ for seed in range(3):
 """
 
 
+@pytest.mark.promise("bus-off")
 def test_turns_in_c_send_no_frame_in_bus_off(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -30,6 +30,8 @@ from kontronik_can_gw.native.rows import MAX_GEAR
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("which-core")
+
 EMPTY = Layout("", "", ())
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Car\nBO_ 256 M: 8 Gw\n SG_ {} Car\n'
 CYCLE = (
@@ -215,6 +217,7 @@ def test_an_object_of_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -
     assert why() == f"{objects.shared_object().name}: built from other sources than this version"
 
 
+@pytest.mark.promise("round-once")
 @needs_c
 @pytest.mark.parametrize(
     ("signal", "more", "said"),

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.promise("parameters", "captures", "unstoppable")
+
 PROJECT = Path(__file__).resolve().parents[2]
 STATES = int(os.environ.get("KCG_PLUG_STATES", "200"))
 SHARES = {"ext4": 0.4, "f2fs": 0.4, "vfat": 0.2}

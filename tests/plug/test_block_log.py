@@ -7,6 +7,8 @@ import block_log
 import pytest
 from block_log import SECTOR, Entry, Log, State, Write, entries_before, read_entries, torn
 
+pytestmark = pytest.mark.promise("sharp-tests")
+
 A, B, C, D = (letter * SECTOR for letter in (b"a", b"b", b"c", b"d"))
 FLUSH = Entry(is_flush=True)
 

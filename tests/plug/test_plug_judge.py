@@ -25,6 +25,8 @@ from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.files import recorder
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("sharp-tests")
+
 NAME = "20260101T000000Z-abcdef-00000.kcap"
 
 

@@ -24,7 +24,10 @@ import pytest
 from built import there
 from every_value import export_shipped
 
-pytestmark = pytest.mark.usefixtures("c_compiler")
+pytestmark = [
+    pytest.mark.promise("no-undefined-behaviour"),
+    pytest.mark.usefixtures("c_compiler"),
+]
 HERE = Path(__file__).parent
 ALARMS = HERE / "alarms.toml"
 HINTS = HERE / "eva_hints.toml"

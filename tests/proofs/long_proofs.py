@@ -12,9 +12,13 @@ from test_dbc_proof import ONE_ESC
 from test_every_value import configuration
 from test_small_scope import SYMBOLS_IN_C, prove_in_c
 
-pytestmark = pytest.mark.usefixtures("c_compiler")
+pytestmark = [
+    pytest.mark.promise("proven-dbc"),
+    pytest.mark.usefixtures("c_compiler"),
+]
 
 
+@pytest.mark.promise("brute-force")
 def test_all_short_streams_give_the_frames_of_brute_force_with_the_whole_prefix(
     tmp_path: Path,
 ) -> None:

@@ -11,7 +11,10 @@ from built import there
 from every_value import DBC
 from worst_case import COMPILER, Limits, build_image, plan_of, search
 
-pytestmark = pytest.mark.usefixtures("c_compiler")
+pytestmark = [
+    pytest.mark.promise("firmware"),
+    pytest.mark.usefixtures("c_compiler"),
+]
 CALLS = 10_000_000
 SEARCHED = {
     "one byte": "`kcg_receive` of one byte",

@@ -11,6 +11,8 @@ from test_corpus import ESCS, FILES, accepted
 
 from kontronik_can_gw.signals.plan import Role
 
+pytestmark = pytest.mark.promise("proven-dbc")
+
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_each_real_dbc_is_proven_except_floats_and_crcs(file: Path) -> None:

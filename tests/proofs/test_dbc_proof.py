@@ -21,6 +21,8 @@ from put_in_faults import Fault
 
 from kontronik_can_gw.assembly.assemble import load_configuration
 
+pytestmark = pytest.mark.promise("proven-dbc")
+
 PROJECT = Path(__file__).resolve().parents[2]
 TESTS = PROJECT / "tests"
 EXAMPLES = {

@@ -2,8 +2,11 @@
 
 from pathlib import Path
 
+import pytest
 from every_value import export_shipped
 from long_eva import add_hints
+
+pytestmark = pytest.mark.promise("no-undefined-behaviour")
 
 
 def test_each_annotation_for_eva_has_its_place_in_the_core(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from kontronik_can_gw.assembly.assemble import load_configuration
 from kontronik_can_gw.native.header import NotInCore, structure
 from kontronik_can_gw.native.tables import Tables
 
+pytestmark = pytest.mark.promise("proven-dbc")
+
 DBCS = ("every_rule.dbc", "protected.dbc")
 ROWS = ("message", "signal", "piece", "pair", "e2e", "settings")
 FIELDS = [

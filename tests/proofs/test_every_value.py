@@ -10,7 +10,10 @@ import pytest
 from every_value import compare_values
 from test_dbc_proof import EVERY_RULE, ONE_ESC
 
-pytestmark = pytest.mark.usefixtures("c_compiler")
+pytestmark = [
+    pytest.mark.promise("true"),
+    pytest.mark.usefixtures("c_compiler"),
+]
 QUIET = EVERY_RULE.replace("[can]", "[can]\nquiet_after_s = 60")
 """Two ESCs, multiplexed messages, a code amid values, messages on change, and quiet mode."""
 PROTECTED = EVERY_RULE.replace("every_rule.dbc", "protected.dbc")
@@ -46,6 +49,7 @@ def test_every_value_of_each_field_is_sent_as_another_dbc_demands(
     assert found.frames > 3 * found.values
 
 
+@pytest.mark.promise("round-once")
 def test_every_voltage_with_every_number_of_cells_is_divided_and_rounded_once(
     tmp_path: Path,
 ) -> None:

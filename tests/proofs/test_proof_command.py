@@ -17,6 +17,8 @@ from specification.quantities import QUANTITIES, Divisor
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.signals.plan import Layout
 
+pytestmark = pytest.mark.promise("proven-dbc")
+
 PROJECT = Path(__file__).resolve().parents[2]
 Prove = Callable[..., "Done"]
 ESC = '[[esc]]\nport = "/dev/ttyUSB0"\npole_pairs = 7\n'

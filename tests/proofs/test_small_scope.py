@@ -21,7 +21,10 @@ from scaled_frames import SCALES, Scale
 from kontronik_can_gw.esc.kontronik import deframer
 from kontronik_can_gw.native.objects import FOLDER
 
-pytestmark = pytest.mark.usefixtures("c_compiler")
+pytestmark = [
+    pytest.mark.promise("brute-force"),
+    pytest.mark.usefixtures("c_compiler"),
+]
 HERE = Path(__file__).parent
 SYMBOLS_IN_C = 10
 SYMBOLS_IN_PYTHON = 7

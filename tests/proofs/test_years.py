@@ -12,7 +12,10 @@ import pytest
 from years import WRAPS, RunInBoth, RunInC, Wrap, build, load_both
 from years_run import main
 
-pytestmark = pytest.mark.usefixtures("c_compiler")
+pytestmark = [
+    pytest.mark.promise("no-overflow"),
+    pytest.mark.usefixtures("c_compiler"),
+]
 NAMES = [wrap.name for wrap in WRAPS]
 
 

@@ -7,6 +7,8 @@ limit, so that ground gained is not lost again. GOALS has the figures at which t
 import pytest
 from plain_english import Measure, measure_groups, measure_text
 
+pytestmark = pytest.mark.promise("plain-english")
+
 LIMITS: dict[str, dict[str, float]] = {
     "product": {
         "all patterns": 4.9,

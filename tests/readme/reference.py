@@ -1,10 +1,12 @@
-"""The pages of docs/reference, generated from their sources. ``make docs`` writes them."""
+"""The pages of docs/reference, made from their sources, for ``make docs``."""
 
 import re
 from argparse import SUPPRESS
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
+
+import promises
 
 from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.cli import COMMANDS
@@ -80,3 +82,4 @@ if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
     for name, text in pages():
         (FOLDER / name).write_text(text, encoding="utf-8")
+    promises.PAGE.write_text(promises.promises_page(), encoding="utf-8")

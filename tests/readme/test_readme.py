@@ -26,6 +26,8 @@ from kontronik_can_gw.config.export import schema
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 
+pytestmark = pytest.mark.promise("docs")
+
 PROJECT = FOLDER.parents[1]
 PATHS = (*BY_HAND, *FOLDER.glob("*.md"))
 PAGES = {path: path.read_text(encoding="utf-8") for path in PATHS}

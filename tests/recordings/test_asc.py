@@ -9,6 +9,8 @@ from log_files import opened
 
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("logs")
+
 MS = 1_000_000
 HEAD = "date Tue Mar 07 10:15:42.400 AM 2023\nbase {} timestamps absolute\ninternal events logged\n"
 FD_TAIL = "  0  0   200000 0 0 0 0 0"

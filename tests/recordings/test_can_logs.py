@@ -25,6 +25,8 @@ from kontronik_can_gw.desk.recordings.log_input import log_format
 from kontronik_can_gw.desk.recordings.recording import LogFrame
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("logs")
+
 FORMATS = sorted(READERS)
 WITH_FD = sorted(set(FORMATS) - {"trc"})
 

@@ -9,6 +9,8 @@ import pytest
 from kontronik_can_gw.desk.recordings.can_logs.text import LONGEST_LINE, CandumpReader
 from kontronik_can_gw.desk.recordings.recording import LogFrame
 
+pytestmark = pytest.mark.promise("logs")
+
 LINES = (
     b"(1700000000.000001) can0 681#0011223344556677 R\n",
     b"(1700000000.000002) can1 681#00 T\n",

@@ -12,6 +12,8 @@ from log_files import READERS, SUFFIX
 
 from kontronik_can_gw.desk.recordings.can_logs.channels import Channels
 
+pytestmark = pytest.mark.promise("logs")
+
 VOLTS = {"can0": 25, "can1": 50}
 FORMATS = sorted(READERS)
 

@@ -19,6 +19,8 @@ from kontronik_can_gw.desk.recordings.log_clock import LogClock
 from kontronik_can_gw.desk.recordings.recording import ClockStep, LogFrame
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("log-times")
+
 MS = 1_000_000
 HOUR_NS = 3_600_000 * MS
 SET_BACK = "the clock was set back by 1 h 00 min 00 s after {} s; times continue without the step"

@@ -14,6 +14,8 @@ from kontronik_can_gw.capture.format import CLOCK_FLAGS, Entry, EntryKind, numbe
 from kontronik_can_gw.native import load
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("log-times", "clock")
+
 WALL_NS = 1_700_000_000 * SECOND
 NOT_RELIABLE = "dates and times of day are not reliable then"
 

@@ -20,6 +20,8 @@ from recordings import candump_log, dump_bytes
 
 from kontronik_can_gw.cli.desk import watched
 
+pytestmark = pytest.mark.promise("outputs-of-commands")
+
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw", "convert"]
 
 

@@ -14,6 +14,8 @@ from log_files import SUFFIX, Item, at_wall, message_of, read_log, some_frames, 
 
 from kontronik_can_gw.errors import UserError
 
+pytestmark = pytest.mark.promise("damaged-logs")
+
 OWN = ["candump", "asc", "trc", "blf"]
 TEXT = ["candump", "asc", "trc"]
 

@@ -15,6 +15,8 @@ from log_files import SUFFIX, Item, at_wall, read_by_library, read_log, some_fra
 from kontronik_can_gw.native.load import PURE, library
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("log-times")
+
 ENDS = [1 << 31, 1 << 32]
 """Unix times in s."""
 BEFORE_NS = SECOND // 2

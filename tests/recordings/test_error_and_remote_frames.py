@@ -15,6 +15,8 @@ from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
 from kontronik_can_gw.desk.recordings.recording import ERROR, LogFrame
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("logs")
+
 MS = 1_000_000
 WALL_NS = 1_700_000_000_000 * MS
 DATA = CanFrame(0x688, bytes.fromhex("000000C409001400"))

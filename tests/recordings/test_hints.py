@@ -12,6 +12,8 @@ import pytest
 from command_line import refused, run
 from simulated_bus import flight, layout_of, write_log
 
+pytestmark = pytest.mark.promise("one-line")
+
 
 def test_frames_missing_in_the_dbc_are_counted_and_a_remedy_is_named(
     tmp_path: Path,

@@ -20,6 +20,8 @@ from kontronik_can_gw.desk.recordings.stream import HEAD
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.signals.unpacker import SignalReader, Unpacker
 
+pytestmark = pytest.mark.promise("tables")
+
 MS = 1_000_000
 Row = tuple[int, tuple[Any, ...]]
 MULTIPLEXED = """VERSION ""

@@ -18,6 +18,8 @@ from kontronik_can_gw.capture.format import EntryKind
 from kontronik_can_gw.desk.recordings import bytes_input
 from kontronik_can_gw.desk.recordings.bytes_input import BytesInput
 
+pytestmark = pytest.mark.promise("tables")
+
 NAMES = ("electrical_speed", "battery_voltage", "battery_current")
 PERIOD_NS = 10_000_000
 STREAMS: dict[str, Callable[[random.Random], bytes]] = {

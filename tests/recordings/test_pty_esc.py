@@ -12,6 +12,8 @@ import pytest
 
 from kontronik_can_gw.desk.pty import PtyEsc
 
+pytestmark = pytest.mark.promise("silent-to-esc")
+
 ALL_BYTES = bytes(range(256))
 
 

@@ -25,6 +25,8 @@ from recordings import candump_log, capture_bytes, convert, dump_bytes
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.recordings.stream import Stream, StreamReader
 
+pytestmark = pytest.mark.promise("streams")
+
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 _HUNG_S = 60
 FORMATS = {"candump": ".log", "asc": ".asc", "blf": ".blf", "trc": ".trc", "mf4-log": ".mf4"}

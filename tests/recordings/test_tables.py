@@ -42,6 +42,8 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("tables")
+
 Cells = list[dict[str, Any]]
 """The values of each row by signal name. None: not available.
 

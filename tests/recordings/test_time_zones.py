@@ -13,6 +13,8 @@ from log_files import READERS, SUFFIX, at_wall, read_by_library, read_log, some_
 from recordings import WALL_NS, capture_bytes, convert
 from test_tables import Cells, read_csv, read_jsonl, read_parquet
 
+pytestmark = pytest.mark.promise("log-times")
+
 
 def test_local_time_is_not_utc() -> None:
     """Otherwise this file proves nothing: see tests/conftest.py."""

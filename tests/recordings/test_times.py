@@ -12,6 +12,8 @@ from log_files import opened
 
 from kontronik_can_gw.frames import CanFrame
 
+pytestmark = pytest.mark.promise("log-times")
+
 MS = 1_000_000
 START_S = 1_700_000_000
 TIMES_MS = (-500, -490, -480, 0, 10, 20)

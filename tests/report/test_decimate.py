@@ -3,11 +3,14 @@
 from collections.abc import Sequence
 from itertools import accumulate, pairwise
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kontronik_can_gw.desk.report.esc import Number
 from kontronik_can_gw.desk.report.flight import MIN_POINTS, Decimator
+
+pytestmark = pytest.mark.promise("report")
 
 NUMBERS = st.one_of(st.none(), st.integers(-50, 50))
 ROWS = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=300)

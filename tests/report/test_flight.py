@@ -31,6 +31,8 @@ from kontronik_can_gw.esc.kontronik.states import (
 from kontronik_can_gw.signals.unpacker import Value
 from kontronik_can_gw.times import SECOND as S
 
+pytestmark = pytest.mark.promise("report")
+
 GAP_NS = 500_000_000
 FAULTS = Faults(
     dropout=Dropout(2 * S, 31 * S),

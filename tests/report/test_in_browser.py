@@ -18,7 +18,11 @@ from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOp
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.times import SECOND as S
 
-pytestmark = [pytest.mark.extended, pytest.mark.skipif(PROGRAM is None, reason=MISSING)]
+pytestmark = [
+    pytest.mark.promise("report"),
+    pytest.mark.extended,
+    pytest.mark.skipif(PROGRAM is None, reason=MISSING),
+]
 
 EVIL = "</script><script>window.hit = 1</script><img src=x onerror='window.hit = 2'>"
 FAULTS = Faults(

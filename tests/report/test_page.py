@@ -18,6 +18,8 @@ from kontronik_can_gw.desk.words import clock, duration, number, wall_clock
 from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND as S
 
+pytestmark = pytest.mark.promise("report")
+
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&<!--\u2028{{data}}"
 
 

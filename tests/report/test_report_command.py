@@ -11,6 +11,8 @@ from kontronik_can_gw.esc.kontronik.simulator import ErrorWindow, EscOptions, Fa
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.times import SECOND as S
 
+pytestmark = pytest.mark.promise("report")
+
 
 @pytest.fixture(scope="module")
 def dump(tmp_path_factory: pytest.TempPathFactory) -> Path:

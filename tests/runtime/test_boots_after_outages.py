@@ -17,6 +17,8 @@ from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS
 
+pytestmark = pytest.mark.promise("boot-ups")
+
 NODES = 2
 PERIOD_MS = 1000
 in_both_cores = pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)

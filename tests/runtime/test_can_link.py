@@ -27,6 +27,8 @@ from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
+pytestmark = pytest.mark.promise("unstoppable")
+
 
 @pytest.fixture(autouse=True)
 def locks_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,6 +215,7 @@ def boot_ups_and_emergencies(frames: list[tuple[int, bytes]]) -> list[str]:
     return names
 
 
+@pytest.mark.promise("bus-off")
 @pytest.mark.parametrize("late_ms", [0, 1, 40, 300])
 def test_a_node_boots_and_sends_8140h_when_the_queue_runs_after_a_restart(
     bench: Bench,
@@ -323,6 +326,7 @@ def test_an_outage_is_logged_with_the_remedy_and_when_it_ends(
     assert back.startswith("CAN can0: frames are sent again, after 5.0 s")
 
 
+@pytest.mark.promise("late-frames")
 def test_a_bus_that_was_stalled_gets_no_backlog(
     bench: Bench,
     caplog: pytest.LogCaptureFixture,
@@ -403,6 +407,7 @@ def test_changed_receive_ids_are_set_on_the_open_port(bench: Bench) -> None:
     assert {0x601, 0x705} <= bench.port._ids
 
 
+@pytest.mark.promise("interface-reopens")
 def test_an_adapter_that_fails_while_it_is_read_is_opened_again(bench: Bench) -> None:
     bench.start()
     bench.turn(100)
@@ -436,6 +441,7 @@ def drone(kernel: Kernel, node_id: int = 42) -> Bench:
     return made
 
 
+@pytest.mark.promise("bus-off")
 @pytest.mark.parametrize("is_drone", [False, True])
 @pytest.mark.parametrize(
     "facts",
@@ -514,6 +520,7 @@ def test_a_gateway_without_nodes_receives_the_same_ids_after_an_outage(kernel: K
     bench.can.close()
 
 
+@pytest.mark.promise("one-device")
 @pytest.mark.parametrize("wait", [False, True])
 def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
     bench: Bench,

@@ -31,6 +31,8 @@ from kontronik_can_gw.runtime.native_poller import poller_for
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("slow-drivers")
+
 ESCS = (EscSettings("esc1", timeout_ns=60_000_000_000),)
 LIMIT_S = 60
 """Time limit in s. Only a hang takes that long."""
@@ -212,6 +214,7 @@ def test_a_driver_that_fails_at_start_ends_a_loop_that_may_not_wait(
     it.loop.end()
 
 
+@pytest.mark.promise("interface-reopens")
 def test_a_lost_driver_is_closed_beside_the_loop_and_opened_again(
     uart: tuple[int, str],
     monkeypatch: pytest.MonkeyPatch,

@@ -31,6 +31,8 @@ from kontronik_can_gw.runtime.can.socketcan_port import SocketCanPort
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("filters")
+
 SOL = socket.SOL_SOCKET
 EXTENDED = 0x80000000
 REMOTE = 0x40000000
@@ -400,6 +402,7 @@ def test_an_interface_that_cannot_be_used_leaves_no_socket_open(
 FRAMES = [CanFrame(0x100 + n, bytes((n,))) for n in range(6)]
 
 
+@pytest.mark.promise("late-frames")
 @pytest.mark.parametrize("stopped_before", range(7))
 def test_frames_that_became_late_in_a_turn_are_not_sent(
     port: CanPort,
@@ -428,6 +431,7 @@ class DatagramSocket(socket.socket):
             super().setsockopt(level, *rest)
 
 
+@pytest.mark.promise("six-frames")
 def test_the_kernel_holds_at_most_six_frames() -> None:
     """Newer values cannot overtake frames that wait in the kernel."""
     ours, others = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)

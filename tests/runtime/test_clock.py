@@ -27,6 +27,8 @@ from kontronik_can_gw.runtime.system.clock import (
 )
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("clock")
+
 UNIX_NS = 1_700_000_000 * SECOND
 
 

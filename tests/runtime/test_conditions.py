@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from kontronik_can_gw.runtime.system.fault_log import FLAPPING, MINUTE, FaultLog
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("fault-log")
+
 NAME = "kontronik_can_gw"
 
 

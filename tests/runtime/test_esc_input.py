@@ -34,6 +34,8 @@ from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("ports-reopen")
+
 LEFT = UsbIdentity(0x403, 0x6001, "A1", "1.0")
 RIGHT = UsbIdentity(0x403, 0x6001, "B2", "1.0")
 LIVE = codec.encode(LiveData(battery_voltage=2442), codec.WireLayout.V4)
@@ -133,6 +135,7 @@ REPLUGGED: dict[str, tuple[dict[str, UsbIdentity], dict[str, UsbIdentity], list[
 }
 
 
+@pytest.mark.promise("adapter-identity")
 @pytest.mark.parametrize(("before", "after", "found"), REPLUGGED.values(), ids=REPLUGGED.keys())
 def test_each_esc_gets_its_own_adapter_after_replugging(
     there: dict[str, UsbIdentity | None],
@@ -159,6 +162,7 @@ def test_each_esc_gets_its_own_adapter_after_replugging(
             assert esc.identity == after[path]
 
 
+@pytest.mark.promise("adapter-identity")
 def test_an_esc_is_found_by_its_adapter(there: dict[str, UsbIdentity | None], bench: Bench) -> None:
     there.clear()
     bench.lose(0, SECOND)
@@ -185,6 +189,7 @@ def test_attempts_to_open_do_not_change_since_when_a_port_is_lost(
     assert esc.facts().lost_since_ns == 7 * SECOND
 
 
+@pytest.mark.promise("esc-diagnosis")
 def test_line_errors_are_counted_by_kind_across_replugging(
     bench: Bench,
 ) -> None:
@@ -203,6 +208,7 @@ def test_line_errors_are_counted_by_kind_across_replugging(
     assert bench.gateway.escs[0].line_errors == 13
 
 
+@pytest.mark.promise("esc-diagnosis")
 def test_a_diagnosis_is_logged_once_and_ends_with_telemetry(
     bench: Bench,
     caplog: pytest.LogCaptureFixture,
@@ -344,6 +350,7 @@ def test_a_loss_is_reported_with_its_errors(
     assert "; 3 CRC errors, " in back
 
 
+@pytest.mark.promise("adapter-identity")
 def test_a_usb_adapter_is_identified_by_its_numbers_or_its_location(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -367,6 +374,7 @@ def test_a_usb_adapter_is_identified_by_its_numbers_or_its_location(
     }
 
 
+@pytest.mark.promise("line-settings")
 def test_settings_changed_by_another_program_are_restored(core_language: str) -> None:
     with PtyEsc() as esc:
         port = serial_port.SerialPort(esc.path, KONTRONIK)
@@ -397,6 +405,7 @@ def test_settings_changed_by_another_program_are_restored(core_language: str) ->
             port.close()
 
 
+@pytest.mark.promise("line-settings")
 @pytest.mark.parametrize("speaks", [True, False])
 def test_settings_are_checked_every_100_ms_while_the_esc_sends(
     speaks: bool,
@@ -499,6 +508,7 @@ def test_pauses_between_attempts_grow_until_a_port_receives_bytes(
     loop.close()
 
 
+@pytest.mark.promise("echo-off", "silent-to-esc")
 def test_echo_is_switched_off_before_anything_else(monkeypatch: pytest.MonkeyPatch) -> None:
     """A new terminal echoes. Bytes that arrive before echo is off are sent back to the ESC."""
     real = serial_port._open

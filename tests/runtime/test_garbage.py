@@ -18,6 +18,8 @@ from kontronik_can_gw.runtime.files.recorder import Recorder
 from kontronik_can_gw.runtime.status.snapshot import snapshot
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("memory")
+
 EVERYTHING = made(2, canopen=True, dronecan={"node_id": 40, "enabled": True})
 """Setup and layout of two ESCs with messages, CANopen nodes and a DroneCAN node."""
 

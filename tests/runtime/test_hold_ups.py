@@ -41,6 +41,8 @@ from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import GatewayState, NmtState
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("hold-ups")
+
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.native_poller import NativePoller
 
@@ -71,6 +73,7 @@ TWO = (EscSettings("esc1", timeout_ns=20 * MS), EscSettings("esc2"))
 LAYOUTS = {count: layout_of(TWO[:count]) for count in (1, 2)}
 
 
+@pytest.mark.promise("true")
 @settings(max_examples=25, deadline=None, phases=[Phase.generate])  # a seed cannot be shrunk
 @given(
     st.integers(0, 2**32),
@@ -192,6 +195,7 @@ def test_bytes_beyond_one_read_are_dated_by_their_position(
     assert abs(wire.frames[-1] - esc.live_bound_ns) <= NS_PER_BYTE
 
 
+@pytest.mark.promise("ports-fair")
 def test_a_port_that_always_has_bytes_does_not_delay_other_ports(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -421,6 +425,7 @@ def test_a_bus_that_takes_only_some_frames_gets_the_others_later(
         assert cast("NativePoller", loop._poller).count > 500
 
 
+@pytest.mark.promise("watchdog")
 @pytest.mark.parametrize(
     "blind",
     [
@@ -621,6 +626,7 @@ def of(frames: list[tuple[int, bytes]], *ids: int) -> list[tuple[int, str]]:
     return [(can_id, data.hex(" ")) for can_id, data in frames if can_id in ids]
 
 
+@pytest.mark.promise("late-frames")
 @pytest.mark.parametrize(
     ("can_id", "request_hex", "answer_id", "answer", "state"),
     [
@@ -686,6 +692,7 @@ def test_waiting_syncs_are_counted_and_not_answered(bench: Bench) -> None:
         assert len(of(bench.take(), TPDO)) == expected
 
 
+@pytest.mark.promise("heartbeats")
 @pytest.mark.parametrize(
     ("came_ms", "codes"),
     [
@@ -716,6 +723,7 @@ def test_heartbeats_are_judged_by_the_time_of_their_arrival(
     assert [data[:2].hex() for data in emergencies] == codes
 
 
+@pytest.mark.promise("late-frames")
 def test_waiting_answers_are_kept_and_measurements_are_computed_again(bench: Bench) -> None:
     bus = bench.world.bus
     bench.write(*WATCH)  # no loss of telemetry causes a frame

@@ -15,6 +15,8 @@ from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("restarts")
+
 DOWN = LinkFacts(exists=True, up=False)
 
 

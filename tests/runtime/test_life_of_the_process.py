@@ -22,6 +22,8 @@ from kontronik_can_gw.cli import main
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.runtime.status.statistics import open_statistics
 
+pytestmark = pytest.mark.promise("service")
+
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 ENOUGH = 36_000
 """Bytes of a capture with some seconds of telemetry."""

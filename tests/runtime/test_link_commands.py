@@ -14,6 +14,8 @@ from kontronik_can_gw.runtime.can import link_commands
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.can.socketcan_port import socketcan_error
 
+pytestmark = pytest.mark.promise("doctor")
+
 ADD = "sudo ip link add vcan0 type vcan && sudo ip link set vcan0 up"
 UP = "sudo ip link set can0 up type can bitrate 500000 restart-ms 100"
 

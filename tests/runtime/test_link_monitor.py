@@ -13,6 +13,8 @@ from kontronik_can_gw.runtime.can import link_monitor
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts, LinkMonitor
 from kontronik_can_gw.status import CanState
 
+pytestmark = pytest.mark.promise("interface-reopens")
+
 
 def attribute(kind: int, value: bytes) -> bytes:
     return struct.pack("=HH", 4 + len(value), kind) + value + bytes(-len(value) % 4)

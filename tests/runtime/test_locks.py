@@ -21,6 +21,8 @@ from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.runtime.system.locks import Locks, Taken, file_name, lock_file
 
+pytestmark = pytest.mark.promise("locks")
+
 CHANNEL = "can0"
 NODES = [f"{CHANNEL}: CANopen node {number}" for number in (5, 6, 7)]
 

@@ -22,6 +22,8 @@ from kontronik_can_gw.runtime.files.recorder import Recorder
 from kontronik_can_gw.runtime.housekeeping import COLLECT_NS
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("memory")
+
 LIVE_EACH = 20 * MS
 EVENTS_A_SECOND = 2 * (SECOND // LIVE_EACH + 1)
 """Live and info frames of two ESCs in a second."""

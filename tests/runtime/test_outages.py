@@ -30,6 +30,8 @@ from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("after-outage")
+
 ESCS = (EscSettings("esc1"),)
 TIMEOUT = ESCS[0].timeout_ns
 FRAME_NS = MS // 4

@@ -16,6 +16,8 @@ from kontronik_can_gw.canopen.storage import Stored, decode, encode
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.files.store import ParameterStore
 
+pytestmark = pytest.mark.promise("parameters")
+
 PATIENCE = 30.0
 """Seconds that a result may take on a busy machine before a test fails."""
 

@@ -15,6 +15,8 @@ from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.status import GatewayState
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("quiet-mode")
+
 QUIET_AFTER_S = 3
 LIVE_ID, STATE_ID = 0x100, 0x200
 LAYOUT = compiled(

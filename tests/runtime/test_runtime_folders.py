@@ -8,6 +8,8 @@ import pytest
 from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.runtime.system.locks import Locks
 
+pytestmark = pytest.mark.promise("folders")
+
 
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

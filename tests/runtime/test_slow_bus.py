@@ -12,6 +12,8 @@ from kontronik_can_gw.capture.format import EntryKind
 from kontronik_can_gw.gateway.gate_table import State
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("slow-bus")
+
 QUARTER = TIMEOUT // 4
 in_all_rates = pytest.mark.parametrize("rate", [100, 40, 28, 20, 10, 5])
 

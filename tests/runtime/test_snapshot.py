@@ -21,6 +21,8 @@ from kontronik_can_gw.runtime.system.process import process_facts, start_ticks
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("status")
+
 
 def test_later_events_do_not_change_the_document_of_a_moment() -> None:
     bench = Bench()

@@ -27,6 +27,8 @@ from kontronik_can_gw.runtime.system.worker import Report
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("status")
+
 PATIENCE = 60.0
 """Seconds that something may take on a busy machine before a test fails."""
 

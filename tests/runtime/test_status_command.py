@@ -34,6 +34,8 @@ from kontronik_can_gw.runtime.system import folders
 from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("status")
+
 Document = dict[str, Any]
 
 

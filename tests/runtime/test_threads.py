@@ -18,6 +18,8 @@ from kontronik_can_gw.runtime.system import worker as worker_module
 from kontronik_can_gw.runtime.system.fault_log import CAPACITY, BackgroundHandler
 from kontronik_can_gw.runtime.system.worker import Handover, Worker, start_beside_the_loop
 
+pytestmark = pytest.mark.promise("threads")
+
 PATIENCE = 120
 
 

@@ -6,6 +6,7 @@ If both have frames left over, queue and slots send in turn.
 from collections import Counter
 from itertools import pairwise
 
+import pytest
 from dbc_bench import compiled
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,6 +15,8 @@ from kontronik_can_gw.frames import FIRST_PART, CanFrame
 from kontronik_can_gw.gateway.transmit_queue import QUEUE_LENGTH, TransmitQueue
 from kontronik_can_gw.signals.packer import compile_frame
 from kontronik_can_gw.status import GatewayStatus
+
+pytestmark = pytest.mark.promise("newest-wins")
 
 
 def queued(number: int, can_id: int = 0x581) -> CanFrame:
@@ -51,6 +54,7 @@ def test_the_queue_is_bounded_and_counts_its_losses() -> None:
     assert send(queue, sent, 9) == 0
 
 
+@pytest.mark.promise("order")
 def test_frames_of_a_step_keep_their_order_and_leftovers_alternate() -> None:
     queue = TransmitQueue()
     sent = list[CanFrame]()

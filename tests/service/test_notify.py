@@ -11,6 +11,8 @@ import pytest
 
 from kontronik_can_gw.runtime.system.sd_notify import Notifier, is_journal, log_formatter
 
+pytestmark = pytest.mark.promise("watchdog")
+
 
 class Manager:
     """The socket at systemd's end."""

@@ -11,6 +11,8 @@ from kontronik_can_gw.cli import service
 from kontronik_can_gw.cli.service import planned
 from kontronik_can_gw.errors import UserError
 
+pytestmark = pytest.mark.promise("service")
+
 UNITS = "etc/systemd/system"
 CONFIGURATION = "etc/kontronik-can-gw/gateway.toml"
 RULES = "etc/udev/rules.d/70-kontronik-can-gw.rules"

@@ -17,7 +17,11 @@ import pytest
 
 from kontronik_can_gw.native.objects import shared_object
 
-pytestmark = [pytest.mark.extended, pytest.mark.usefixtures("c_compiler")]
+pytestmark = [
+    pytest.mark.promise("service"),
+    pytest.mark.extended,
+    pytest.mark.usefixtures("c_compiler"),
+]
 
 HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parents[1]

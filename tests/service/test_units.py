@@ -18,6 +18,8 @@ from kontronik_can_gw.cli.service import planned
 from kontronik_can_gw.runtime.can.interface_restart import FOLDER
 from kontronik_can_gw.runtime.system.folders import NAME, RUN
 
+pytestmark = pytest.mark.promise("service")
+
 NAMES = ("kontronik-can-gw.service", "kontronik-can-gw@.service")
 BESIDE = tuple(
     f"kontronik-can-gw-{kind}{end}.service"

@@ -31,6 +31,8 @@ from kontronik_can_gw.signals.packer import compile_frame, float_of, ratio
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS
 
+pytestmark = pytest.mark.promise("packing")
+
 ESCS = (
     EscSettings("left", pole_pairs=7, gear=Fraction(31, 4), timeout_ns=250 * MS),
     EscSettings("right", pole_pairs=1, gear=Fraction(1), cell_count=12, timeout_ns=100 * MS),
@@ -95,6 +97,7 @@ def test_ratio_beyond_a_double_is_infinite() -> None:
     assert ratio(1, 4) == 0.25
 
 
+@pytest.mark.promise("codes")
 @pytest.mark.parametrize("seed", range(FILES))
 def test_random_layout_is_packed_as_oracle_and_cantools_expect(seed: int) -> None:
     rng = random.Random(seed)

@@ -20,6 +20,8 @@ from kontronik_can_gw.signals.plan import SignalPlan
 from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import MS, SECOND
 
+pytestmark = pytest.mark.promise("packing")
+
 
 def wanted(plan: SignalPlan, raw: Any, bits: int) -> Any:
     """Return the value for the raw number that cantools decodes."""

@@ -19,6 +19,8 @@ from kontronik_can_gw.runtime.can.can_port import CanPort
 from kontronik_can_gw.runtime.can.open_can import open_can
 from kontronik_can_gw.times import SECOND
 
+pytestmark = pytest.mark.promise("filters")
+
 
 def peer_on(interface: str) -> RawBus:
     """Return another participant, which receives all frames except marks."""

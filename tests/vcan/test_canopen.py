@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import canopen
+import pytest
 from feeder import Identity
 from vcan_tools import EDS, LIMIT_S, canopen_table, chain, wait_for
 
 from kontronik_can_gw.esc.kontronik.codec import WireLayout
+
+pytestmark = pytest.mark.promise("nmt")
 
 BOOT_UP = 0
 STATES = {"OPERATIONAL": 5, "STOPPED": 4, "PRE-OPERATIONAL": 127}

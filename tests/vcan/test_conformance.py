@@ -9,6 +9,8 @@ import pytest
 from conformance_report import PAGE, conformance, gateway_with_a_node
 from foreign_tools import FOREIGN, NODE_CANOPEN, PACKAGES, need
 
+pytestmark = pytest.mark.promise("cia-301")
+
 VERDICT = re.compile(r"(passed|failed|deviates|not supported) +([a-z0-9-]+): ")
 
 

@@ -22,6 +22,8 @@ from vcan_tools import chain, configuration, ip, recording, wait_for
 from kontronik_can_gw.capture.format import Block, Damage, Scanner
 from kontronik_can_gw.cli import main
 
+pytestmark = pytest.mark.promise("doctor")
+
 
 @pytest.fixture
 def adapter() -> Iterator[Adapter]:

@@ -15,7 +15,10 @@ from vcan_tools import LIMIT_S, GatewayProcess, configuration, feeding, sent_by,
 
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("dronecan"),
+    pytest.mark.extended,
+]
 dronecan: Any = import_module("dronecan")
 Start = Callable[..., GatewayProcess]
 

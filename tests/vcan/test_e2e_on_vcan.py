@@ -5,12 +5,15 @@ The receivers of the package autosar-e2e accept each frame, also over a loss of 
 
 from pathlib import Path
 
+import pytest
 from e2e_oracle import COUNTER_BITS, DATA_IDS, counter_of, is_right
 from packer_oracle import Msg, Sig, dbc_text
 from vcan_tools import GatewayProcess, configuration, feeding, recording, wait_for
 
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.signals.e2e import PROFILES
+
+pytestmark = pytest.mark.promise("e2e")
 
 FIRST_ID = 0x300
 NAMES = {FIRST_ID + number: name for number, name in enumerate(PROFILES)}

@@ -13,6 +13,8 @@ from vcan_tools import chain, wait_for
 from kontronik_can_gw.esc.kontronik.codec import WireLayout
 from kontronik_can_gw.esc.kontronik.states import Device
 
+pytestmark = pytest.mark.promise("true")
+
 LINK_THERE = (2, 3)
 """States Ok and Degraded. A link is Degraded if its ESC waits for the bus to show each frame."""
 LINK_LOST = 4

@@ -3,11 +3,14 @@
 import signal
 from pathlib import Path
 
+import pytest
 from vcan_tools import GatewayProcess, configuration, feeding, recording, wait_for
 
 from kontronik_can_gw.capture.replay import SETTLE_NS
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.times import SECOND
+
+pytestmark = pytest.mark.promise("events")
 
 BEFORE_S = 3
 FRAMES_BEFORE = 100 * (BEFORE_S + 20)

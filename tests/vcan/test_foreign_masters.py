@@ -26,7 +26,10 @@ from vcan_tools import (
     wait_for,
 )
 
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("foreign-masters"),
+    pytest.mark.extended,
+]
 
 Start = Callable[..., GatewayProcess]
 

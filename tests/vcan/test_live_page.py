@@ -17,6 +17,8 @@ from vcan_tools import GatewayProcess, configuration, ip, wait_for
 
 from kontronik_can_gw.desk.live.server import UPDATE_S
 
+pytestmark = pytest.mark.promise("live-page")
+
 SLOW = ("--js-flags=--jitless",)
 """User Mode Linux has no address space for compiled JavaScript."""
 Start = Callable[..., GatewayProcess]

@@ -3,8 +3,11 @@
 import re
 from collections.abc import Callable
 
+import pytest
 from harness import PtyPort
 from vcan_tools import GatewayProcess, configuration, ip, wait_for
+
+pytestmark = pytest.mark.promise("monitor")
 
 Start = Callable[..., GatewayProcess]
 

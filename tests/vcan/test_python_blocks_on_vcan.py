@@ -9,7 +9,10 @@ from shell_blocks import PROJECT, Block, blocks, run_block
 
 from kontronik_can_gw.canopen.storage import decode
 
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("docs"),
+    pytest.mark.extended,
+]
 
 BLOCKS = blocks(language="python")
 EXAMPLES = [block for block in BLOCKS if "canopen.Network()" in block.text]

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from vcan_tools import GatewayProcess, configuration, feeding, wait_for
 
+pytestmark = pytest.mark.promise("quiet-mode")
+
 QUIET = "quiet_after_s = 3\n"
 BEGIN = "quiet: no ESC was heard for 3"
 END = "quiet mode ends: an ESC is heard"

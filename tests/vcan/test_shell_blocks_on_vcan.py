@@ -7,7 +7,10 @@ from pathlib import Path
 import pytest
 from shell_blocks import Block, blocks, make_files, run_block
 
-pytestmark = pytest.mark.extended
+pytestmark = [
+    pytest.mark.promise("docs"),
+    pytest.mark.extended,
+]
 
 BEFORE = """
 sudo() { "$@"; }

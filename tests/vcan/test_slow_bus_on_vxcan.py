@@ -20,6 +20,8 @@ from vcan_tools import GatewayProcess, configuration, ip
 
 from kontronik_can_gw.native import load
 
+pytestmark = pytest.mark.promise("slow-bus")
+
 TIMEOUT_NS = 250_000_000
 QUARTER_NS = TIMEOUT_NS // 4
 SLACK_NS = 30_000_000

@@ -10,6 +10,8 @@ import sys
 import pytest
 import vm_run
 
+pytestmark = pytest.mark.promise("independent-tests")
+
 
 @pytest.fixture
 def no_vcan_here(monkeypatch: pytest.MonkeyPatch) -> None:
