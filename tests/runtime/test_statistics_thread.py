@@ -134,10 +134,19 @@ def test_a_file_of_the_user_is_neither_replaced_nor_removed(
     assert put(statistics, 2) == []
     statistics.close()
     assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize("left_over", ["of a gateway", ""])
+def test_file_that_a_killed_gateway_left_is_replaced(
+    file: Path, statistics: Statistics, left_over: str
+) -> None:
+    put(statistics, 1)
+    document = file.read_text() if left_over else ""
+    statistics.close()
     after = Statistics(file)
-    file.write_text('{"format":1,"program":"kontronik-can-gw"}')  # left over by a killed gateway
-    put(after, 3)
-    assert number_in(file) == 3
+    file.write_text(document)
+    assert put(after, 2) == []
+    assert number_in(file) == 2
     after.close()
     assert not file.exists()
 

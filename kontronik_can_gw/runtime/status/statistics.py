@@ -7,6 +7,7 @@ assignment. So neither the disk nor the making of the document delays the loop.
 
 import contextlib
 import errno
+import json
 import os
 import time
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.runtime.files.disk import reason_of, write_new
-from kontronik_can_gw.runtime.status.snapshot import STALE_NS, Moment, snapshot
+from kontronik_can_gw.runtime.status.snapshot import PROGRAM, STALE_NS, Moment, snapshot
 from kontronik_can_gw.runtime.system.folders import STATUS_FILE, make_runtime_folder, status_name
 from kontronik_can_gw.runtime.system.locks import Locks
 from kontronik_can_gw.runtime.system.worker import Report, Worker
@@ -22,8 +23,8 @@ from kontronik_can_gw.times import SECOND
 
 PERIOD_NS = SECOND
 _CLOSE_S = 0.2
-_BEGIN = b'{"format":'
-"""The first bytes of each status file."""
+_LARGEST = 1 << 22
+"""More bytes than a status file ever has."""
 
 
 def open_statistics(
@@ -97,10 +98,16 @@ def has_other_content(path: Path) -> bool:
     """Return True if a file has content that no gateway has written as its status."""
     try:
         with path.open("rb") as file:
-            begin = file.read(len(_BEGIN))
+            content = file.read(_LARGEST)
     except FileNotFoundError:
         return False
-    return begin not in (b"", _BEGIN)
+    if not content:
+        return False
+    try:
+        document = json.loads(content)
+    except (ValueError, RecursionError):
+        return True
+    return not isinstance(document, dict) or document.get("program") != PROGRAM
 
 
 class Statistics:
