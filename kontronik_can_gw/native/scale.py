@@ -199,9 +199,12 @@ class _IntegerScale:
 
         found = simplest(slope, is_good)
         lowest, end = intercepts(found)
-        div = found.denominator
-        while (add := math.ceil(lowest * div)) >= end * div:
-            div += found.denominator
+        under = found.denominator
+        lowest *= under
+        end *= under
+        intercept = simplest((lowest + end) / 2, lambda other: lowest <= other < end)
+        div = under * intercept.denominator
+        add = math.ceil(lowest * intercept.denominator)
         return self._within_limits(int(found * div), add, div, most, (by, 1))
 
     def _most(self, slope: Fraction) -> int:

@@ -1,15 +1,15 @@
-"""Feeds changed DBC text to both cores, which must agree:  fuzz_dbc.py SECONDS SEED CORE
+"""Feeds changed DBC text to both cores, which must agree:  fuzz_dbc.py TEXTS SEED CORE
 
 Coverage does not guide the random changes, because libFuzzer cannot measure it in Python. A DBC is
 refused by a UserError, or by NotInCore of the C core. Any other exception is a fault for the seed
-that was printed last.
+that was printed last, and so is a text that takes five minutes.
 """
 
+import faulthandler
 import logging
 import random
 import re
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from kontronik_can_gw.native.binding import load
 from kontronik_can_gw.native.rows import NotInCore
 
 STEPS = 40
+LIMIT_S = 300
 NUMBERS = (
     "0",
     "1",
@@ -115,15 +116,14 @@ def one(library: Any, seed: int) -> int:
     return both.run(STEPS)
 
 
-def main(seconds: str, seed: str, core: str) -> None:
+def main(texts: str, first: str, core: str) -> None:
     logging.disable()
     library = load(Path(core))
     found: list[int] = []
-    end = time.monotonic() + float(seconds)
-    while time.monotonic() < end:
-        number = int(seed) + len(found)
-        print(f"seed {number}", flush=True)  # a sanitizer ends the process
-        found.append(one(library, number))
+    for seed in range(int(first), int(first) + int(texts)):
+        print(f"seed {seed}", flush=True)  # a sanitizer ends the process
+        faulthandler.dump_traceback_later(LIMIT_S, exit=True)
+        found.append(one(library, seed))
     print(f"{found.count(0)} of {len(found)} refused, {sum(found)} frames compared")
     assert 0 < found.count(0) < len(found)
 

@@ -225,6 +225,15 @@ def test_no_factor_is_suggested_if_none_is_almost_equal() -> None:
     assert str(found.value) == reason
 
 
+def test_offset_far_beyond_all_values_is_refused_at_once() -> None:
+    """The numbers are not searched by counting, which would not end."""
+    layout = compiled(
+        HEAD + ' SG_ S : 0|16@1+ (0.01,1e300) [0|0] "V" X\n', bind={"S": "battery_voltage"}
+    )
+    with pytest.raises(NotInCore, match=r"M\.S: .* exceeds 64 bits"):
+        Tables(CoreSettings([EscSettings("esc1")], layout))
+
+
 FLOAT = ' SG_ S : 0|{}@1- ({},0) [0|0] "{}" X\nSIG_VALTYPE_ 256 S : {};\n'
 SINGLE = 32, 1
 DOUBLE = 64, 2
