@@ -14,6 +14,7 @@ import pytest
 pytestmark = pytest.mark.promise("parameters", "captures", "unstoppable")
 
 PROJECT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.usefixtures("c_compiler")  # for the time of the virtual machine
 STATES = int(os.environ.get("KCG_PLUG_STATES", "200"))
 SHARES = {"ext4": 0.4, "f2fs": 0.4, "vfat": 0.2}
 SECONDS_A_STATE = 2
