@@ -53,6 +53,7 @@ BLOCKING = {
 ONLY_IN = {
     "cantools": (
         "dbc/",
+        "desk/dbc/",
         "assembly/capture_setup.py",
         "assembly/assemble.py",
         "desk/recordings/layouts.py",
@@ -132,6 +133,30 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
+NEVER_ON_THE_BOARD = {
+    "__main__": "starts the command line",
+    "esc.kontronik.simulator": "a part of the protocol",
+    "native.compile": "compiles the core when the package is built",
+}
+"""Modules outside desk and cli that `run` never imports, with the reason why they are there."""
+
+
+def test_everything_outside_desk_and_cli_is_imported_by_run() -> None:
+    files = {_module_name(path): path for path in MODULES}
+    outputs = {name for name in files if name.startswith(tuple(f"{NAME}.{o}." for o in OUTPUTS))}
+    waiting = {f"{NAME}.cli.run", *outputs}
+    found = set[str]()
+    while waiting:
+        found |= waiting
+        waiting = set().union(*(_imported_modules(files[each], files) for each in waiting)) - found
+    unused = [
+        name.removeprefix(f"{NAME}.")
+        for name, path in files.items()
+        if name not in found and _room(path) not in ("desk", "cli") and path.name != "__init__.py"
+    ]
+    assert sorted(unused) == sorted(NEVER_ON_THE_BOARD)
+
+
 def _calls(path: Path) -> set[str]:
     """Return the plain functions that are called in a file, for example ``open``."""
     tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
@@ -207,6 +232,7 @@ OUTPUT_TOOLS = (
     "cli/describe.py",
     "cli/eds.py",
     "desk/conformance/eds_",
+    "desk/dbc/",
     "desk/describe/",
 )
 """Modules that describe CANopen nodes: commands for EDS and DBC files, tables, a slave's EDS."""

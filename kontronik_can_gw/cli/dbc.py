@@ -8,7 +8,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from kontronik_can_gw.canopen.dbc import pdo_text, waiting_for_lss
 from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all, say
@@ -18,7 +17,8 @@ from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import load_database
-from kontronik_can_gw.dbc.writer import copies_text
+from kontronik_can_gw.desk.dbc.canopen import pdo_text, waiting_for_lss
+from kontronik_can_gw.desk.dbc.writer import copies_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 

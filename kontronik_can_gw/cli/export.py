@@ -20,8 +20,8 @@ from kontronik_can_gw.cli.output import (
 )
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.export_c import EXAMPLE, exported
 from kontronik_can_gw.errors import RunError, UserError
-from kontronik_can_gw.native.export_c import EXAMPLE, exported
 from kontronik_can_gw.native.rows import NotInCore
 
 OPTIONS = (

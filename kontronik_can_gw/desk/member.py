@@ -8,14 +8,14 @@ import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.desk.receiver.unpacker import Value
+from kontronik_can_gw.desk.receiver.view import View
 from kontronik_can_gw.esc.decoder import ErrorBit, Severity
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.signals import units
-from kontronik_can_gw.signals.unpacker import Value
 
 _WORDS = {"operating_errors": Group.LIVE, "selftest_errors": Group.INFO}
 """The error words, and the group in which each is available."""

@@ -16,6 +16,8 @@ from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.receiver.bus_listener import BusListener
+from kontronik_can_gw.desk.receiver.unpacker import SignalReader
 from kontronik_can_gw.desk.recordings.inputs import Input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.esc.kontronik.simulator import (
@@ -29,9 +31,7 @@ from kontronik_can_gw.esc.kontronik.simulator import (
 )
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.runtime.can.bus_listener import BusListener
 from kontronik_can_gw.runtime.can.open_can import check_interface
-from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND
 
 _MAX_LAG_S = 0.5

@@ -15,11 +15,11 @@ from eds_text import SHIPPED as EDS_TEXT
 from eds_text import variable, with_object
 from packer_oracle import ERROR_BITS, KNOWN, pascal, read
 
-from kontronik_can_gw.canopen import dbc as canopen_dbc
 from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.dbc.names import esc_prefix
-from kontronik_can_gw.dbc.writer import copies_text
+from kontronik_can_gw.desk.dbc import canopen as canopen_dbc
+from kontronik_can_gw.desk.dbc.writer import copies_text
 from kontronik_can_gw.esc.kontronik.simulator import (
     BYTE_NS,
     Dropout,

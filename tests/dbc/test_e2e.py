@@ -25,7 +25,7 @@ from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc import e2e_attributes
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.writer import copies_text
+from kontronik_can_gw.desk.dbc.writer import copies_text
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings

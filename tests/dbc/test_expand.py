@@ -19,9 +19,10 @@ from packer_oracle import LayoutMaker, Msg, Sig, bindings, dbc_text, read
 
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
-from kontronik_can_gw.dbc import expand, writer
+from kontronik_can_gw.dbc import expand
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
+from kontronik_can_gw.desk.dbc import writer
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.signals.plan import Layout, MessagePlan
 

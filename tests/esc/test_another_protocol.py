@@ -21,6 +21,7 @@ from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.pty import PtyEsc
+from kontronik_can_gw.desk.receiver.unpacker import SignalReader
 from kontronik_can_gw.desk.recordings.fields import fields_of_values
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import protocols
@@ -32,7 +33,6 @@ from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.ports.serial_port import SerialPort
 from kontronik_can_gw.runtime.status.facts import PortFacts
 from kontronik_can_gw.runtime.status.snapshot import _esc
-from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND
 
 from .kiss import KISS, frame

@@ -6,10 +6,10 @@ import pytest
 from simulated_bus import Clock
 
 from kontronik_can_gw.config.keys import CanConfig
+from kontronik_can_gw.desk.receiver import bus_listener
+from kontronik_can_gw.desk.receiver.bus_listener import BusListener
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.runtime.can import bus_listener
-from kontronik_can_gw.runtime.can.bus_listener import BusListener
 from kontronik_can_gw.status import CanState
 
 pytestmark = pytest.mark.promise("monitor")

@@ -23,11 +23,11 @@ from kontronik_can_gw.cli import source as source_of_commands
 from kontronik_can_gw.config.keys import CanConfig, shipped
 from kontronik_can_gw.desk import member, sources
 from kontronik_can_gw.desk.monitor import model, screen, status, watch
+from kontronik_can_gw.desk.receiver import bus_listener
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.desk.sources import Recording
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, SimulatedEsc
-from kontronik_can_gw.runtime.can import bus_listener
 
 pytestmark = pytest.mark.promise("monitor")
 

@@ -18,10 +18,11 @@ from packer_oracle import read
 from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of, with_errors
 
 from kontronik_can_gw.config.keys import MqttConfig
-from kontronik_can_gw.dbc.writer import copies_text
+from kontronik_can_gw.desk.dbc.writer import copies_text
 from kontronik_can_gw.desk.mqtt.messages import Publication, Publisher, iso
 from kontronik_can_gw.desk.mqtt.published import MIN_PAUSE_NS
 from kontronik_can_gw.desk.mqtt.topics import Topics
+from kontronik_can_gw.desk.receiver.unpacker import SignalReader
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,
     ErrorWindow,
@@ -30,7 +31,6 @@ from kontronik_can_gw.esc.kontronik.simulator import (
     Phase,
 )
 from kontronik_can_gw.esc.kontronik.states import OperatingError, OperatingState, SelfTestError
-from kontronik_can_gw.signals.unpacker import SignalReader
 
 pytestmark = pytest.mark.promise("mqtt")
 

@@ -12,8 +12,8 @@ from built import STRICT
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.export_c import exported
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.native.export_c import exported
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.status import CanState, GatewayState

@@ -12,11 +12,11 @@ from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
+from kontronik_can_gw.desk.export_c import exported
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.core import NativeCore
-from kontronik_can_gw.native.export_c import exported
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.signals.plan import Layout
 from kontronik_can_gw.times import MS

@@ -35,7 +35,7 @@ from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.native.export_c import exported
+from kontronik_can_gw.desk.export_c import exported
 from kontronik_can_gw.native.load import make_core
 
 MS = 1_000_000

@@ -14,11 +14,11 @@ from firmware import Case
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.export_c import exported
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
-from kontronik_can_gw.native.export_c import exported
 
 pytestmark = pytest.mark.promise("firmware")
 

@@ -20,8 +20,8 @@ from specification.rule import Rule, Shape
 from kontronik_can_gw.assembly.assemble import load_configuration
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.export_c import exported
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
-from kontronik_can_gw.native.export_c import exported
 
 HERE = Path(__file__).parent
 OPTIONS = ("-std=gnu99", "-O2", "-DKCG_SLICES=8")

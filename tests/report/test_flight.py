@@ -14,6 +14,7 @@ import pytest
 from report_flights import Row, column, flight_of, rows_of, simulated
 from simulated_bus import layout_of
 
+from kontronik_can_gw.desk.receiver.unpacker import Value
 from kontronik_can_gw.desk.recordings.fields import ColumnType, TableColumn
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.report.esc import EscFlight
@@ -28,7 +29,6 @@ from kontronik_can_gw.esc.kontronik.states import (
     OperatingState,
     SelfTestError,
 )
-from kontronik_can_gw.signals.unpacker import Value
 from kontronik_can_gw.times import SECOND as S
 
 pytestmark = pytest.mark.promise("report")

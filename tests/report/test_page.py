@@ -9,13 +9,13 @@ import pytest
 from report_flights import data_of, flight_of, rows_of, simulated
 from simulated_bus import layout_of
 
+from kontronik_can_gw.desk.receiver.unpacker import SignalReader
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.desk.recordings.recording import RowBlock
 from kontronik_can_gw.desk.recordings.samples import fields_of_log
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import of_like_size, render
 from kontronik_can_gw.desk.words import clock, duration, number, wall_clock
-from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND as S
 
 pytestmark = pytest.mark.promise("report")

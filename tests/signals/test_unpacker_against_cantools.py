@@ -13,11 +13,11 @@ from test_packer_against_cantools import ESCS, MESSAGES
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.dbc.prepare import prepare
-from kontronik_can_gw.dbc.view import View
+from kontronik_can_gw.desk.receiver.unpacker import SignalReader
+from kontronik_can_gw.desk.receiver.view import View
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals.plan import SignalPlan
-from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import MS, SECOND
 
 pytestmark = pytest.mark.promise("packing")

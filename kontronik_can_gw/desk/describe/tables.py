@@ -13,11 +13,11 @@ from fractions import Fraction
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.canopen.dbc_names import pascal_case
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import TABLES, shipped
 from kontronik_can_gw.dbc.prepare import is_mute, reporter
+from kontronik_can_gw.desk.dbc.canopen_names import pascal_case
 from kontronik_can_gw.desk.describe.markdown import MarkdownTable, Row
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.esc.decoder import EscProtocol, State

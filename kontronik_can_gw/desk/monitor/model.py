@@ -6,15 +6,15 @@ All values are read from CAN frames. Pure: no I/O, no clock.
 from collections import deque
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.member import Alarm, Member
+from kontronik_can_gw.desk.receiver.unpacker import SignalReader
+from kontronik_can_gw.desk.receiver.view import View
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import SECOND
 
 HISTORY_S = 60

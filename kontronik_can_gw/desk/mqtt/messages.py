@@ -20,13 +20,13 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.config.keys import MqttConfig
-from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.mqtt.discovery import device
 from kontronik_can_gw.desk.mqtt.published import Published
 from kontronik_can_gw.desk.mqtt.topics import Topics
+from kontronik_can_gw.desk.receiver.unpacker import SignalReader
+from kontronik_can_gw.desk.receiver.view import View
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.signals.unpacker import SignalReader
 from kontronik_can_gw.times import MS, SECOND
 
 ONLINE = b"online"

@@ -6,8 +6,8 @@ No I/O, no clock: time is an argument.
 from collections.abc import Sequence
 from typing import Any
 
-from kontronik_can_gw.dbc.view import View
 from kontronik_can_gw.desk.member import Alarm, Member
+from kontronik_can_gw.desk.receiver.view import View
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize

@@ -30,8 +30,8 @@ from kontronik_can_gw.status import GatewayState
 from kontronik_can_gw.times import MS
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.native.offline import Frames
-    from kontronik_can_gw.native.player import Player
+    from kontronik_can_gw.desk.recordings.offline import Frames
+    from kontronik_can_gw.desk.recordings.player import Player
 
 CHUNK = 1 << 16
 """Number of bytes that are read at once."""

@@ -37,9 +37,9 @@ from kontronik_can_gw.runtime.files.disk import is_locked
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
+    from kontronik_can_gw.desk.recordings.offline import Frames
+    from kontronik_can_gw.desk.recordings.player import Player
     from kontronik_can_gw.gateway.gateway import Gateway
-    from kontronik_can_gw.native.offline import Frames
-    from kontronik_can_gw.native.player import Player
 
 CHUNK = 1 << 18
 """Number of bytes that are read at once."""

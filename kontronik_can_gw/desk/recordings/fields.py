@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
+from kontronik_can_gw.desk.receiver.unpacker import Value
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Divisor, Group, physical, steps, values_of_esc
 from kontronik_can_gw.esc.values import Value as EscValue
-from kontronik_can_gw.signals.unpacker import Value
 from kontronik_can_gw.status import GatewayStatus
 
 TIME = "Time"

@@ -1,7 +1,7 @@
 """Plays recorded bytes of ESCs through the gateway's core.
 
-The C core plays them at full speed (native/player.py). The Python core is used if the C core is
-not available.
+The C core plays them at full speed (player.py). The Python core is used if the C core is not
+available.
 """
 
 from abc import abstractmethod
@@ -26,8 +26,8 @@ from kontronik_can_gw.native import load
 from kontronik_can_gw.signals.plan import Layout
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.native.offline import Frames, Rows
-    from kontronik_can_gw.native.player import Player
+    from kontronik_can_gw.desk.recordings.offline import Frames, Rows
+    from kontronik_can_gw.desk.recordings.player import Player
 
 NO_MESSAGES = Layout("", "", ())
 
@@ -157,8 +157,8 @@ class PlayedInput(Input):
         """
         if self.setup.version == 1 or load.library()[0] is None:
             return None
-        from kontronik_can_gw.native.offline import ColumnOf
-        from kontronik_can_gw.native.player import Player
+        from kontronik_can_gw.desk.recordings.offline import ColumnOf
+        from kontronik_can_gw.desk.recordings.player import Player
         from kontronik_can_gw.native.rows import NotInCore
 
         if fields is None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
 
 from kontronik_can_gw.capture.replay import TimedFrame
+from kontronik_can_gw.desk.receiver.unpacker import SignalReader, Value
 from kontronik_can_gw.desk.recordings.fields import TableColumn, fields_of_values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.stream import Stream
@@ -19,11 +20,10 @@ from kontronik_can_gw.desk.words import duration
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.printable import counted
-from kontronik_can_gw.signals.unpacker import SignalReader, Value
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.native.offline import Frames, Rows
+    from kontronik_can_gw.desk.recordings.offline import Frames, Rows
 
 Batch: TypeAlias = "list[TimedFrame] | list[LogFrame] | Frames"
 """Frames in their order. The gateway sent all those of a ``Frames``."""

@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.core.output import Output
-from kontronik_can_gw.dbc.view import Freshness
+from kontronik_can_gw.desk.receiver.unpacker import Column, SignalReader, Value
+from kontronik_can_gw.desk.receiver.view import Freshness
 from kontronik_can_gw.desk.recordings.fields import ColumnType, Read, TableColumn, distinct
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, LogFrame, Sample
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
@@ -23,7 +24,6 @@ from kontronik_can_gw.esc.values import VALUES, Group, Kind
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals import units
 from kontronik_can_gw.signals.plan import MessagePlan, SendType
-from kontronik_can_gw.signals.unpacker import Column, SignalReader, Value
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS
 

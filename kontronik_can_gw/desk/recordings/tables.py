@@ -27,7 +27,7 @@ from kontronik_can_gw.native import load
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
-    from kontronik_can_gw.native.offline import Lines
+    from kontronik_can_gw.desk.recordings.offline import Lines
 
 _MAX_INT64 = 1 << 63
 _KEPT_TEXTS = 1024
@@ -194,7 +194,7 @@ class TextTable:
         return self._makers[is_trusted]
 
     def _make_lines(self, is_trusted: bool | None) -> "Lines":
-        from kontronik_can_gw.native.offline import Lines, Style
+        from kontronik_can_gw.desk.recordings.offline import Lines, Style
 
         utc = None
         if self._table.has_utc:

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.recordings.offline import ROWS, ColumnOf, FrameRoom, Frames, Rows
 from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.header import KCG, structure
-from kontronik_can_gw.native.offline import ROWS, ColumnOf, FrameRoom, Frames, Rows
 from kontronik_can_gw.native.tables import Places, bind, places_of
 from kontronik_can_gw.signals.plan import Layout
 

@@ -4,11 +4,11 @@ import re
 from collections.abc import Mapping, Sequence
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.dbc_names import emergency_names, pascal_case
 from kontronik_can_gw.canopen.dictionary import Variable
 from kontronik_can_gw.canopen.eds import EdsEntry
 from kontronik_can_gw.canopen.objects import Bound
-from kontronik_can_gw.dbc.writer import SignalRow
+from kontronik_can_gw.desk.dbc.canopen_names import emergency_names, pascal_case
+from kontronik_can_gw.desk.dbc.writer import SignalRow
 from kontronik_can_gw.esc.decoder import ErrorBit, EscProtocol
 from kontronik_can_gw.esc.telemetry import LinkState
 from kontronik_can_gw.signals.plan import SignalPlan

@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 from kontronik_can_gw.canopen.bound_values import message_plan
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
-from kontronik_can_gw.canopen.dbc_names import Names, emergency_names, pascal_case
-from kontronik_can_gw.canopen.dbc_signals import signals_of, unsigned_signal
 from kontronik_can_gw.canopen.emergency_codes import Register
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.nodes import Nodes
 from kontronik_can_gw.canopen.pdo import EVENT_TYPES, Tpdo
 from kontronik_can_gw.dbc.names import esc_prefix
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.dbc.writer import MessageRow, SignalRow, dbc_text
+from kontronik_can_gw.desk.dbc.canopen_names import Names, emergency_names, pascal_case
+from kontronik_can_gw.desk.dbc.canopen_signals import signals_of, unsigned_signal
+from kontronik_can_gw.desk.dbc.writer import MessageRow, SignalRow, dbc_text
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.status import UNCONFIGURED, NmtState
 from kontronik_can_gw.times import MS

@@ -11,9 +11,9 @@ not available. It also becomes None if its message is missing for this time:
 
 from collections.abc import Sequence
 
+from kontronik_can_gw.desk.receiver.unpacker import Chunk, Part, SignalReader, Value
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import SendType
-from kontronik_can_gw.signals.unpacker import Chunk, Part, SignalReader, Value
 from kontronik_can_gw.times import MS, SECOND
 
 _MIN_NS = 250 * MS

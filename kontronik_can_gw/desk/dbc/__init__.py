@@ -1,0 +1,1 @@
+"""Writes DBC files: from a template, and of CANopen nodes."""
