@@ -362,7 +362,7 @@ static void ask_all(kcg_turns *t)
     kcg_turn_ports *p = &t->ports;
     kcg_turn_times *times = &t->times;
     if (!p->fds[p->bus_place].revents)
-        times->bus_empty = times->polled;
+        times->before = times->polled;
     times->polled = now_ns();
     t->result.happened = poll(p->fds, p->count, 0);
     if (t->result.happened < 0)
@@ -417,7 +417,7 @@ static int wait_for_turn(kcg_turns *t)
     t->times.now = now_ns();
     t->result.late = t->times.now - last - pause;
     r->ready = r->at = r->size = r->has_advanced = 0;
-    if (ready < 0 || t->result.late > request->max_late || t->times.now >= request->due)
+    if (ready < 0 || t->result.late > request->max_turn || t->times.now >= request->due)
         return 0;
     for (int i = 0; i < ready; i++) {
         uint32_t place = events[i].data.u32;

@@ -43,8 +43,8 @@ typedef struct {
     int64_t outputs_due;  /* Next deadline of the outputs: return KCG_OUTPUTS at this time. */
     int64_t leave;        /* Return after the first turn at this time or later. */
     int64_t period;       /* Longest time between two polls of all descriptors. */
-    int64_t max_late;     /* Return if a turn is later than this: the process was held up. */
-    int64_t max_turn;     /* Do not send frames whose turn has lasted longer than this. */
+    int64_t max_turn;     /* Do not send frames whose turn has lasted longer than this. Return if a
+                             turn is later than this: the process was held up. */
     int64_t check_period; /* Time between two checks of `departures`. */
     int64_t frame_size;   /* Memory of a frame in the kernel's queue in bytes. 0: unknown. */
     int32_t bus;          /* Socket of the CAN interface. */
@@ -53,12 +53,11 @@ typedef struct {
     uint32_t reserved;
 } kcg_turn_request;
 
-/* Times in ns. The owner writes the first three before kcg_begin and reads them after a run. */
+/* Times of the loop in ns. LoopTimes in runtime/poller.py describes the fields of the same name. */
 typedef struct {
-    int64_t now;              /* Time of the current turn, or of the last one. */
-    int64_t polled;           /* Last poll of all descriptors. */
-    int64_t bus_empty;        /* Last poll at which the bus had nothing to be read. */
-    int64_t settings_checked; /* Last check of the ports' settings. */
+    int64_t now, polled;
+    int64_t before; /* Last poll at which the bus had nothing to be read. */
+    int64_t settings_checked;
 } kcg_turn_times;
 
 /* The result of a run. */

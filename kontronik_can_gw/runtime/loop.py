@@ -18,8 +18,8 @@ from kontronik_can_gw.printable import counted
 from kontronik_can_gw.runtime.can.can_link import CanLink
 from kontronik_can_gw.runtime.files.parameter_saver import ParameterSaver
 from kontronik_can_gw.runtime.housekeeping import Housekeeping
-from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
-from kontronik_can_gw.runtime.ports.esc_port import LOOK_NS, EscPort
+from kontronik_can_gw.runtime.poller import Handler, Poller, Work
+from kontronik_can_gw.runtime.ports.esc_port import CHECK_EACH_NS, EscPort
 from kontronik_can_gw.runtime.ports.usb_adapters import UsbIdentity
 from kontronik_can_gw.runtime.status.facts import ProgramFacts
 from kontronik_can_gw.runtime.status.statistics import Statistics
@@ -65,17 +65,17 @@ class Loop:
         self.gateway = gateway
         self.conditions = FaultLog()
         self._clock = clock
-        self._wait = wait_for_devices
+        self._is_patient = wait_for_devices
         self._store = store
         self._notifier = notifier or Notifier({})
         self._statistics = statistics
         self._recorder = recorder
-        self._now = self._look_due = self._revision = 0
-        self._due: int | None = None  # the next deadline; None if it must be computed again
+        self._revision = 0
         self._stopping = False
         self._reason = "stopped"
         self._is_ready = False
         self._poller = poller or Poller(clock)
+        self._native = cast("NativePoller", poller) if self._poller.is_native else None
         self._lost: set[EscPort] = set()
         self.escs = [
             EscPort(i, path, gateway, self._poller, self.conditions, self._lost, clock)
@@ -121,11 +121,11 @@ class Loop:
         try:
             # The ports are opened and locked first, so that no CAN adapter's driver opens them.
             for esc in self.escs:
-                esc.open(now, self._wait, self._others(esc))
-            self.can.open(now, self._wait)
+                esc.open(now, self._is_patient, self._others(esc))
+            self.can.open(now, self._is_patient)
             if self._recorder is not None:
                 self._housekeeping.note_clock()  # first, so that the first header has it
-                self._recorder.start(self._wait)
+                self._recorder.start(self._is_patient)
                 self.conditions.log(logging.INFO, f"recording to {self._recorder.words}")
         except UserError:
             self.close()
@@ -154,7 +154,7 @@ class Loop:
         """Start the gateway."""
         self._poller.begin()
         now = self._clock()
-        self._now = now
+        self._poller.times.now = now
         self.gateway.start(now, self.can.is_open)
         self.can.follow_ids()  # first, because a master may send requests after the boot-up message
         self.can.transmit(now)
@@ -171,40 +171,40 @@ class Loop:
 
     def turn(self) -> None:
         """Wait until a descriptor is ready or work is due, and do the work."""
-        period = self.gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
-        if self.gateway.status.is_quiet:
-            period = _QUIET_PERIOD_NS
-        ready = None
-        if self._poller.is_native:
-            leave = self._housekeeping.due  # what the controller says is asked for with it
-            native = cast("NativePoller", self._poller)
-            ready = native.turn(self.can, self._now, self._own_deadline(), leave, period)
-        if in_python := ready is None:
-            if self._due is None:
-                self._due = self._next_deadline()
-            ready = self._poller.wait(self._now, min(self._now + period, self._due))
-            is_over = self._poller.now < self._due
-        else:
-            is_over, self._due = self._poller.is_over, None
-        now = self._poller.now
+        ready, is_due = self._wait()
+        times = self._poller.times
+        now = times.polled
         late = self._poller.late
-        held_up = late > MIN_HELD_UP_NS and late > self.can.transmitter.max_turn_ns()
-        if held_up:
+        is_late = late > self.can.transmitter.max_turn_ns()
+        if is_late:
             self._follow_hold_up(late, now)
-        if held_up or ready or not is_over:
+        if is_late or ready or is_due:
             now = self._serve(ready, now)
-            self._due = None
         elif now >= self.can.controller.due:
             self.can.ask(now)
-            self._due = None
-        self._now = now
-        if in_python and now >= self._look_due:
-            self._look_due = now + LOOK_NS
+        times.now = now
+        if now - times.settings_checked >= CHECK_EACH_NS:
+            times.settings_checked = now
             for esc in self.escs:
                 esc.hold_settings()
         if now >= self._housekeeping.due:
             self._housekeeping.run(now)
-            self._due = None
+
+    def _wait(self) -> Work:
+        """Wait for work, and meanwhile let C run iterations if possible."""
+        gateway = self.gateway
+        own_due = self._own_deadline()
+        period = gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
+        if gateway.status.is_quiet:
+            period = _QUIET_PERIOD_NS
+        if self._native is not None and self._native.can_run(self.can):
+            leave = self._housekeeping.due  # what the controller says is asked for with it
+            return self._native.run(self.can, own_due, leave, period)
+        # A change during sending can have produced frames.
+        due = 0 if gateway.frames_wait else min(own_due, gateway.next_deadline())
+        times = self._poller.times
+        ready = self._poller.wait(min(times.now + period, due))
+        return Work(ready, times.polled >= due)
 
     def _serve(self, ready: list[tuple[Handler, int]], now: int) -> int:
         """Call the handlers, do the due work, and send the resulting frames. Returns the time."""
@@ -216,9 +216,8 @@ class Loop:
             now = self._reopen(now)
         has_outputs = gateway.has_outputs
         if has_outputs:
-            self._saver.save(
-                now
-            )  # first, so that its answers are sent in this turn, as in a replay
+            # First, so that its answers are sent in this turn, as in a replay.
+            self._saver.save(now)
         can.look(now)
         gateway.advance(now)
         if has_outputs:
@@ -267,11 +266,6 @@ class Loop:
 
     def _woken(self, _now: int, _events: int) -> None:
         self._wake.take()
-
-    def _next_deadline(self) -> int:
-        if self.gateway.frames_wait:  # a change during sending has produced them
-            return 0
-        return min(self._own_deadline(), self.gateway.next_deadline())
 
     def _own_deadline(self) -> int:
         """Return the time of the next work apart from the gateway's."""

@@ -1,4 +1,4 @@
-"""Runs turns of the loop in C, if the core is in C, too.
+"""Runs iterations of the loop in C, if the core is in C, too.
 
 The loop in C only reads ports, and sends due frames. It returns for all other work.
 """
@@ -15,7 +15,7 @@ from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.gateway.gate import Gate
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native.turns import OUTPUTS
-from kontronik_can_gw.runtime.poller import MIN_HELD_UP_NS, Handler, Poller
+from kontronik_can_gw.runtime.poller import Poller, Work
 from kontronik_can_gw.runtime.port_input import PortInput
 from kontronik_can_gw.times import MS
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from kontronik_can_gw.native.core import NativeCore
     from kontronik_can_gw.runtime.can.can_link import CanLink
     from kontronik_can_gw.runtime.can.can_port import CanPort
-    from kontronik_can_gw.runtime.can.transmitter import Transmitter
 
 _HANDOVER_NS = 250 * MS
 """C hands recorded calls over after the first turn at this age. Until then, a loss of power
@@ -37,19 +36,22 @@ def poller_for(gateway: Gateway) -> Poller:
 
 
 class NativePoller(Poller):
-    """A poller that also runs turns of the loop in C. ``count`` is their number."""
+    """A poller that also runs iterations of the loop in C."""
 
     is_native = True
 
     def __init__(self, gateway: Gateway, clock: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(clock)
         self.count = 0
+        """Number of iterations in C."""
         self._gateway = gateway
         self._core = cast("NativeCore", gateway.core)
         self._turns = self._core.turns()
         self._turns.request.is_recorded = gateway.is_recorded
+        self.times = self._turns.times
+        self.times.now = self.times.polled = self.times.before = clock()
         self._seen_changes = -1
-        self._fits = True
+        self._can_watch = True
         self._signals: tuple[int, int] | None = None
         self._woken_before = -1
 
@@ -77,88 +79,96 @@ class NativePoller(Poller):
         with contextlib.suppress(BlockingIOError):
             os.read(self._signals[0], 4096)
 
-    def turn(
-        self,
-        can: "CanLink",
-        last: int,
-        due: int,
-        leave: int,
-        period: int,
-    ) -> list[tuple[Handler, int]] | None:
-        """Run turns in C until there is work for the loop. Returns the handlers to call then.
+    def can_run(self, can: "CanLink") -> bool:
+        """Return True if C can make the next iteration. Python makes it in these cases:
 
-        Returns None if turns in C are not possible now. ``last`` is the time of the last turn,
-        ``due`` of the loop's own next work, and ``leave`` of the latest return. ``period`` is the
-        longest duration of a wait. All are in ns.
+        1. Python needs each live frame, for a PDO that C cannot make or for ``record.when``.
+        2. The gateway has frames to send, or they are held or limited.
+        3. There is no interface with a socket, or its state was not passed to the gateway yet.
+        4. The gate to the bus looks closely (``Gate.may_run_in_c``), or the bus is off.
+        5. There are more descriptors than C can watch.
         """
         gateway = self._gateway
+        port = can.port
         if self._core.reports_live or gateway.frames_wait or gateway.is_held:
-            return None
-        port = _plain_port(can, gateway)
-        if port is None or not self._watches():
-            return None
+            return False
+        if port is None or port.gone or not port.is_socket:
+            return False
+        if port.state is not gateway.status.can_state or can.controller.is_off:
+            return False
+        return can.is_proven and can.transmitter.is_idle and self._watch_descriptors()
+
+    def run(self, can: "CanLink", due: int, leave: int, period: int) -> Work:
+        """Run iterations in C until there is work for the loop. ``can_run`` must be true.
+
+        ``due`` is the time of the loop's own next work, and ``leave`` of the latest return.
+        ``period`` is the longest duration of a wait. All are in ns.
+        """
         turns = self._turns
-        request, times, result = turns.request, turns.times, turns.result
-        times.now = last
-        times.polled = self.now
-        times.bus_empty = self.before
-        gate = can.gate
-        _write_departures(gate, turns.departures)
-        request.leave = min(leave, last + _HANDOVER_NS) if gateway.is_recorded else leave
-        request.due = min(due, self._core.deadline_in_python())
-        request.outputs_due = gateway.next_deadline(with_core=False)
-        self._set_bus(port, period, can.transmitter)
-        recorded = cast("RecordedGateway", gateway) if gateway.is_recorded else None
+        recorded = cast("RecordedGateway", self._gateway) if self._gateway.is_recorded else None
         if recorded is not None:
-            recorded.prepare_turns(last)
+            leave = min(leave, self.times.now + _HANDOVER_NS)
+            recorded.prepare_turns(self.times.now)
+        self._set_request(can, due, leave, period)
+        _write_departures(can.gate, turns.departures)
         turns.begin()
         while turns.run():
-            if not self._follow():
-                self._core.dispatch_others(times.now)
-                if turns.has_unread:
-                    self._core.receive(*turns.read())
-                turns.leave()
+            if not self._follow_event():
+                self._leave()
                 break
-        _read_departures(turns.departures, gate, times.now)
+        _read_departures(turns.departures, can.gate, self.times.now)
+        result = turns.result
         self.count += result.turns
-        self.before = times.bus_empty
-        self.now = times.polled
         self.late = result.late
         if recorded is not None:
             recorded.turned(turns.entries(), result.taken)
-        self.is_over = bool(result.is_over)
         if unsent := turns.unsent():
             can.transmitter.put_refused(unsent, turns.full_since)
         if result.event >= 0 and turns.has_advanced:
-            self._finish(can, times.now)
-        return self.handlers(turns.ready()) if result.happened else []
+            self._finish(can)
+        ready = self.handlers(turns.ready()) if result.happened else []
+        return Work(ready, not result.is_over)
 
-    def _set_bus(self, port: "CanPort", period_ns: int, transmitter: "Transmitter") -> None:
+    def _set_request(self, can: "CanLink", due: int, leave: int, period: int) -> None:
         request = self._turns.request
+        port = cast("CanPort", can.port)
+        request.due = min(due, self._core.deadline_in_python())
+        request.outputs_due = self._gateway.next_deadline(with_core=False)
+        request.leave = leave
+        request.period = period
+        request.check_period = can.gate.period_ns
+        request.max_turn = can.transmitter.max_turn_ns()
         request.bus = port.fileno()
         request.count_fd = port.count_fd
-        max_turn_ns = transmitter.max_turn_ns()
-        request.period = period_ns
-        request.check_period = transmitter.gate.period_ns
         request.frame_size = port.frame_size
-        request.max_turn = max_turn_ns
-        request.max_late = max(MIN_HELD_UP_NS, max_turn_ns)
 
-    def _finish(self, can: "CanLink", now: int) -> None:
-        """Make the rest of a turn at the turn's own time, as a replay does."""
+    def _leave(self) -> None:
+        """Leave the rest of the iteration to the loop, after an event."""
+        turns = self._turns
+        self._core.dispatch_others(self.times.now)
+        if turns.has_unread:
+            self._core.receive(*turns.read())
+        turns.leave()
+
+    def _finish(self, can: "CanLink") -> None:
+        """Make the rest of an iteration at its own time, as a replay does."""
+        now = self.times.now
         self._core.advance_in_python(now)
         self._gateway.advance(now, with_core=False)
         can.transmit(now)
 
-    def _follow(self) -> bool:
+    def _follow_event(self) -> bool:
         """Follow the event that C returned, or let time pass for the outputs.
 
-        Return False if the loop must make the rest of the turn. Usually the outputs make only
+        Return False if the loop must make the rest of the iteration. Usually the outputs make only
         frames, if anything, and C sends these first.
         """
-        gateway, core, turns = self._gateway, self._core, self._turns
+        gateway = self._gateway
+        core = self._core
+        turns = self._turns
         request = turns.request
-        event, now = turns.result.event, turns.times.now
+        event = turns.result.event
+        now = self.times.now
         revision = gateway.revision
         if is_due := event == OUTPUTS:
             gateway.advance(now, with_core=False)
@@ -168,9 +178,9 @@ class NativePoller(Poller):
             return False
         if not is_due and event & Event.QUIET:  # the gate follows it
             return False
-        request.outputs_due = outputs_due = gateway.next_deadline(with_core=False)
-        request.due = due = min(request.due, core.deadline_in_python())
-        if now >= (min(due, outputs_due) if is_due else due):
+        request.outputs_due = gateway.next_deadline(with_core=False)
+        request.due = min(request.due, core.deadline_in_python())
+        if now >= request.due or (is_due and now >= request.outputs_due):
             return False
         if frames := gateway.output_frames:
             if not turns.add_output_frames(frames):
@@ -178,11 +188,12 @@ class NativePoller(Poller):
             frames.clear()
         return True
 
-    def _watches(self) -> bool:
+    def _watch_descriptors(self) -> bool:
+        """Let C watch the descriptors. Return False if that is impossible."""
         if self._seen_changes != self.changes:
             self._seen_changes = self.changes
-            self._fits = self._turns.watch(self.watched())
-        return self._fits
+            self._can_watch = self._turns.watch(self.watched())
+        return self._can_watch
 
 
 def _write_departures(gate: Gate, departures: Any) -> None:
@@ -208,12 +219,3 @@ def _read_departures(departures: Any, gate: Gate, now: int) -> None:
         departures.check_due,
         now,
     )
-
-
-def _plain_port(can: "CanLink", gateway: Gateway) -> "CanPort | None":
-    """Return the interface if C can hand frames to its socket now, otherwise None."""
-    port = can.port
-    is_plain = can.is_proven and can.transmitter.is_idle and not can.controller.is_off
-    if port is None or port.gone or not is_plain or port.state is not gateway.status.can_state:
-        return None
-    return port if port.is_socket else None

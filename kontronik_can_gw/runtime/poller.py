@@ -12,17 +12,43 @@ import contextlib
 import select
 import time
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from kontronik_can_gw.runtime.port_input import PortInput
-from kontronik_can_gw.times import MS, SECOND
+from kontronik_can_gw.times import SECOND
 
 Handler = Callable[[int, int], None]
 """Called with the time and the events (select.POLLIN, POLLOUT)."""
 
 
-MIN_HELD_UP_NS = 20 * MS
-"""A turn that is later than this, and than ``Transmitter.max_turn_ns``, was held up."""
 _IN = select.POLLIN
+
+
+class Work(NamedTuple):
+    """The work that ends a wait of the loop."""
+
+    ready: list[tuple[Handler, int]]
+    """The handlers of the ready descriptors, with their events."""
+    is_due: bool
+    """True if other work than that of the handlers is due."""
+
+
+class LoopTimes:
+    """Times of the loop in ns.
+
+    The loop in C continues with the same times. It has a structure with the same attributes
+    (``kcg_turn_times`` in native/linux.h).
+    """
+
+    def __init__(self, now: int) -> None:
+        self.now = now
+        """Time of the current iteration, or the last one."""
+        self.polled = now
+        """Time of the last poll of all descriptors."""
+        self.before = now
+        """Time of an earlier poll. Frames that are read from the bus now have arrived since."""
+        self.settings_checked = 0
+        """Time of the last check of the settings of the ports."""
 
 
 class Poller:
@@ -36,14 +62,9 @@ class Poller:
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock
-        self.now = clock()
-        """The time of the last look at the descriptors."""
-        self.before = self.now
-        """The time of the look before. Bytes that were not there then have arrived since."""
+        self.times: Any = LoopTimes(clock())
         self.late = 0
         """By how many ns the last turn and the wait took longer than planned."""
-        self.is_over = False
-        """True if only the handlers of ready descriptors remain to be called in this turn."""
         self.changes = 0
         """Increases with each change of the watched descriptors."""
         self._poll = select.poll()
@@ -81,20 +102,20 @@ class Poller:
         with contextlib.suppress(OSError):  # it is already closed
             self._epoll.unregister(fd)
 
-    def wait(self, last: int, due: int) -> list[tuple[Handler, int]]:
+    def wait(self, due: int) -> list[tuple[Handler, int]]:
         """Wait for an event, a signal, or the time ``due``, rounded up to a millisecond.
 
-        ``last`` is the time of the last turn. Returns the handlers of the ready descriptors, with
-        their events.
+        Returns the handlers of the ready descriptors, with their events.
         """
         pause = due - self._clock()
         if pause > 0:
             self._epoll.poll(pause / SECOND, 1)
         else:
             pause = 0
-        self.before = self.now
-        self.now = self._clock()
-        self.late = self.now - last - pause
+        times = self.times
+        times.before = times.polled
+        times.polled = self._clock()
+        self.late = times.polled - times.now - pause
         return self.handlers(self._poll.poll(0))
 
     def handlers(self, happened: list[tuple[int, int]]) -> list[tuple[Handler, int]]:

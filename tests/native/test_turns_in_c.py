@@ -253,7 +253,7 @@ def test_changed_error_bits_interrupt_turns_in_c_only_if_needed(
     it = InC(monkeypatch, outputs=[_nodes(ESCS)] if has_nodes else [])
     poller: Any = it.loop._poller
     events: list[int] = []
-    _count(monkeypatch, poller, "_follow", lambda: events.append(poller._turns.result.event))
+    _count(monkeypatch, poller, "_follow_event", lambda: events.append(poller._turns.result.event))
     it.feed(LiveData(operating_errors=n // 2 % 2 << 20) for n in range(400))
     it.run(4)
     assert len(it.turns) < 4 * 4

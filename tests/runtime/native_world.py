@@ -21,7 +21,7 @@ from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import OPTIONS
 from kontronik_can_gw.runtime.can.can_link import CanLink
 from kontronik_can_gw.runtime.native_poller import NativePoller
-from kontronik_can_gw.runtime.poller import Handler
+from kontronik_can_gw.runtime.poller import Handler, Work
 from kontronik_can_gw.runtime.ports.serial_port import PortLost
 
 if TYPE_CHECKING:
@@ -122,30 +122,14 @@ class FakeNativePoller(NativePoller):
         self._world.unregister(fd)
         self.changes += 1
 
-    def turn(
-        self,
-        can: CanLink,
-        last: int,
-        due: int,
-        leave: int,
-        period: int,
-    ) -> list[tuple[Handler, int]] | None:
-        return super().turn(
-            can,
-            last,
-            min(due, self._world.until),
-            leave,
-            period,
-        )
+    def run(self, can: CanLink, due: int, leave: int, period: int) -> Work:
+        return super().run(can, min(due, self._world.until), leave, period)
 
-    def wait(
-        self,
-        last: int,
-        due: int,
-    ) -> list[tuple[Handler, int]]:
-        ready = self._world.wait(last, due)
-        self.before = self._world.before
-        self.now = self._world.looked
+    def wait(self, due: int) -> list[tuple[Handler, int]]:
+        times = self.times
+        ready = self._world.wait(times.now, due)
+        times.before = self._world.before
+        times.polled = self._world.looked
         self.late = self._world.late
         return ready
 

@@ -430,14 +430,11 @@ class FakePoller(Poller):
     def unregister(self, fd: int) -> None:
         self._world.unregister(fd)
 
-    def wait(
-        self,
-        last: int,
-        due: int,
-    ) -> list[tuple[Handler, int]]:
-        ready = self._world.wait(last, due)
-        self.before = self._world.before
-        self.now = self._world.looked
+    def wait(self, due: int) -> list[tuple[Handler, int]]:
+        times = self.times
+        ready = self._world.wait(times.now, due)
+        times.before = self._world.before
+        times.polled = self._world.looked
         self.late = self._world.late
         return ready
 

@@ -267,7 +267,7 @@ class CanLink:
             self.gate.made_room()
             self._watch(select.POLLIN)
         if events & select.POLLIN:
-            since = self._poller.before if self._drained else 0
+            since = self._poller.times.before if self._drained else 0
             frames = self.port.receive()
             self._drained = self.port.drained
             self._gateway.status.received_frames += len(frames)

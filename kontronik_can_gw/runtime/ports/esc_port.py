@@ -26,8 +26,8 @@ from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
 MAX_RETRY_NS = SECOND
-LOOK_NS = 100 * MS
-"""Interval between checks of the ports' settings while the loop runs in Python.
+CHECK_EACH_NS = 100 * MS
+"""Interval between checks of the ports' settings.
 
 Twin in C: CHECK_EACH of native/linux.c.
 
@@ -168,7 +168,7 @@ class EscPort:
                 self._retry.succeeded()
             since = noted.undrained_ns
             if since == NEVER:
-                since = max(noted.empty_ns, self._poller.before)
+                since = max(noted.empty_ns, self._poller.times.before)
             if port.drained:
                 noted.undrained_ns = NEVER
             else:
