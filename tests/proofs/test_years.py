@@ -24,8 +24,8 @@ def years_library(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return load_both(build(tmp_path_factory.mktemp("years")))
 
 
-def test_the_page_about_proofs_states_the_number_of_wraps() -> None:
-    page = Path(__file__).parents[2].joinpath("docs", "proof.md").read_text(encoding="utf-8")
+def test_the_readme_states_the_number_of_wraps() -> None:
+    page = Path(__file__).with_name("README.md").read_text(encoding="utf-8")
     assert re.findall(r"\| (\d+) wraps \|", page) == 2 * [str(len(WRAPS))]
 
 
