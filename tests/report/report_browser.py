@@ -144,15 +144,20 @@ class Browser:
         self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
+        # Until the page before is gone, it reports errors, such as a server that has ended.
+        self._navigate("about:blank")
         self.errors.clear()
         self.requests.clear()
-        self._loaded = False
-        self.call("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
-        while not self._loaded:
-            self._receive()
+        self._navigate(page if isinstance(page, str) else page.resolve().as_uri())
         while not self.run(ready):
             self.settle()
         self.settle()
+
+    def _navigate(self, address: str) -> None:
+        self._loaded = False
+        self.call("Page.navigate", url=address)
+        while not self._loaded:
+            self._receive()
 
     def settle(self) -> None:
         """Wait until two frames are drawn."""
