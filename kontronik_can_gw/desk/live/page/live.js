@@ -22,7 +22,6 @@
   let steps = []; // the newest steps, oldest first
   let isPaused = false;
   let selected = null; // index of the ESC on the whole screen, null for all
-  let isTold = false; // an alarm is shown in the title
   let told = "";
   const beyond = new Set(); // figures beyond a limit of this device
 
@@ -79,7 +78,6 @@
       const text = `no connection for ${seconds} s${refused ? `: ${refused}` : ""}`;
       if (byId("offline").textContent !== text) byId("offline").textContent = text;
       setTitle("offline", "no connection");
-      beyond.clear();
       if (performance.now() - tried > RETRY_MS) connect();
     }
   }
@@ -192,7 +190,6 @@
   const ageText = (seconds) => (seconds < 60 ? `${seconds.toFixed(1)} s` : clock(seconds, 0));
 
   function showAlarms(alarms) {
-    const present = alarms.filter((alarm) => alarm.to === null);
     const items = alarms.map((alarm) => {
       const length = ageText((alarm.to ?? 0) - alarm.from);
       const when = alarm.to === null ? `for ${length}` : `ended ${ageText(-alarm.to)} ago, lasted ${length}`;
@@ -212,9 +209,12 @@
       put(list.children[index].children[0], item.name + item.text);
       put(list.children[index].children[1], item.when);
     });
-    const worst = present.find((alarm) => alarm.severity === "error") ?? present[0];
-    isTold = Boolean(worst) || beyond.size > 0;
-    setTitle(isTold ? "error" : "ok", worst ? `⚠ ${worst.text}` : beyond.size ? "⚠ limit" : "");
+    const present = items.filter((item) => item.to === null);
+    const worst = present.find((item) => item.severity === "error") ?? present[0];
+    byId("worst").hidden = !worst;
+    byId("worst").className = worst?.severity ?? "";
+    if (worst) put(byId("worst"), `${worst.name}${worst.text}${present.length > 1 ? ` (and ${present.length - 1} more)` : ""}`);
+    setTitle(worst || beyond.size ? "error" : "ok", worst ? `⚠ ${worst.text}` : beyond.size ? "⚠ limit" : "");
     view.data.errors = alarms.filter((alarm) => alarm.severity !== "status");
   }
 
@@ -347,6 +347,7 @@
     later: () => view.pan(0.3),
     whole: () => view.setRange(-layout.stepCount, 0),
     back: () => select(null),
+    worst: () => byId("alarms-title").scrollIntoView(),
     reset: () => fetch("/reset", COMMAND).catch(() => {}),
   };
   for (const [id, action] of Object.entries(actions)) byId(id).addEventListener("click", () => (layout || id === "reset") && action());
