@@ -155,7 +155,7 @@ def test_every_step_is_in_one_tier_and_every_marker_is_run() -> None:
 
 
 def test_a_step_may_take_as_long_as_the_page_about_proofs_says() -> None:
-    page = (checks.PROJECT / "docs" / "proof.md").read_text(encoding="utf-8")
+    page = (checks.PROJECT / "tests/proofs/README.md").read_text(encoding="utf-8")
     row = r"^\| `make release ARGS=\"--only (\w+)\".*\| (\d+) hours \|$"
     rows = re.findall(row, page, re.MULTILINE)
     assert dict(rows) == {"years": "9"}
