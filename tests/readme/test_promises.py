@@ -26,24 +26,24 @@ def test_the_page_is_made_from_rules_and_markers() -> None:
 
 
 def test_markers_of_files_and_of_tests_are_read() -> None:
-    file = read_markers("tests/test_a.py", MARKED)
+    file = read_markers("samples/test_a.py", MARKED)
     assert file is not None
     found = [(str(test), key) for test, key in file.markers]
-    link = "* [tests/test_a.py](../tests/test_a.py)"
+    link = "* [samples/test_a.py](../samples/test_a.py)"
     named = f"{link}:\n  `test_a_thing`"
     assert found == [(link, "one"), (named, "two"), (named, "three")]
-    assert read_markers("tests/helper.py", "def make(): pass") is None
+    assert read_markers("samples/helper.py", "def make(): pass") is None
 
 
 def test_a_missing_test_and_a_missing_rule_are_named() -> None:
-    marked = read_markers("tests/test_a.py", MARKED.replace('"two", ', ""))
-    bare = read_markers("tests/test_b.py", "def test_b(): pass")
+    marked = read_markers("samples/test_a.py", MARKED.replace('"two", ', ""))
+    bare = read_markers("samples/test_b.py", "def test_b(): pass")
     assert marked is not None
     assert bare is not None
     assert list(list_problems(RULES, [marked, bare])) == [
         'rule "two" has no test. Add pytest.mark.promise("two") to the test that holds it.',
-        'tests/test_a.py names the rule "three". Add it to promises.toml.',
-        "tests/test_b.py names no rule. Add pytestmark = pytest.mark.promise(KEY) to it.",
+        'samples/test_a.py names the rule "three". Add it to promises.toml.',
+        "samples/test_b.py names no rule. Add pytestmark = pytest.mark.promise(KEY) to it.",
     ]
 
 

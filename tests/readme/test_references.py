@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.promise("docs")
+
 PROJECT = Path(__file__).resolve().parents[2]
 PACKAGE = PROJECT / "kontronik_can_gw"
 PARTS = ("kontronik_can_gw", "tests", "docs", "examples", "dbc", "eds", "deb", ".ci")
@@ -126,6 +128,8 @@ def _is_defined(file: str, name: str) -> bool:
     if file.endswith(".c"):
         homes = [path for path in PACKAGE.rglob("*.[ch]") if str(path).endswith(f"/{file}")]
         return any(re.search(rf"\b{name}\(", path.read_text(encoding="utf-8")) for path in homes)
+    if file.startswith("tests/"):
+        return f"\ndef {name}(" in (PROJECT / file).read_text(encoding="utf-8")
     known = _names()
     if owner:
         return member in known.get(owner, set())
