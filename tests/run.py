@@ -16,7 +16,7 @@ test-all, the slow checks and the checks with other programs:
             `test-all` as root.
   masters   tests marked "extended" on a vcan, with CANopen masters of other projects
   prove     the proofs of docs/proof.md that end within five minutes
-  cuts      200 states after a loss of power, in User Mode Linux
+  cuts      200 states after a power loss, in User Mode Linux
 
 prove, the same step alone
 
@@ -32,7 +32,7 @@ release, by hand on a quiet machine:
   eva       no undefined behaviour in the core, with Frama-C
   worst     the longest path through the machine code for an ARM processor
   years     ten years of virtual time through the core in C (-- --years 0.1)
-  plug      10 000 states after a loss of power
+  plug      10 000 states after a power loss
   wheels    wheels for other machines
   deb       the Debian packages in fresh roots of both releases
 

@@ -22,9 +22,9 @@ from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, Si
 from kontronik_can_gw.status import GatewayStatus
 
 _LAST_VALUE = 1
-"""2100h:5: SDO answers with the last value while telemetry is lost. With 0 it aborts."""
+"""2100h:5: SDO responses with the last value while telemetry is lost. With 0 it aborts."""
 _CODES = 2
-"""2100h:5: SDO answers with the number that means "not available" in a PDO."""
+"""2100h:5: SDO responses with the number that means "not available" in a PDO."""
 _EVENT_OF_PACE = {
     Group.LIVE: Event.LIVE,
     Group.INFO: Event.INFO,

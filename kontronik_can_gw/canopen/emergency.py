@@ -34,7 +34,7 @@ class Emergencies:
 
     Emergencies are sent in the order in which the errors happened. After a hold-up of the process,
     the loss of telemetry may be noticed before older frames are read. So each loss of telemetry
-    delays emergencies until ``advance``, which the loop calls at the end of every turn.
+    delays emergencies until ``advance``, which the loop calls at the end of every iteration.
     """
 
     def __init__(

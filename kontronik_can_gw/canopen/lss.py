@@ -1,7 +1,7 @@
 """The node-ID and identity of one node (1018h, 2101h), and its LSS slave (CiA 305).
 
 Pass every data frame of 7E5h to ``receive``. Answers for 7E4h are passed to ``send``. No input
-raises, and no clock is needed, because the slave has no time-outs.
+raises, and no clock is needed, because the slave has no timeouts.
 
 If independent stacks (CANopenNode, Lely) disagree, this slave follows the stricter reading:
 

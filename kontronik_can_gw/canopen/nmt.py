@@ -17,7 +17,7 @@ _SELF_START_OFF = 4
 _CATCHING_UP_NS = SECOND // 2
 """After a hold-up, a heartbeat counts as missing only after this time, or if it was seen late.
 
-Frames that arrived during the hold-up are read in several turns of the loop.
+Frames that arrived during the hold-up are read in several iterations of the loop.
 """
 
 

@@ -160,7 +160,7 @@ class Node:
         yield Use(self.sync.cob_id, "SYNC", SYNC)
         yield Use(SDO_REQUEST + self.node_id, f"SDO requests to {name}")
         yield Use(HEARTBEAT + self.node_id, f"the heartbeat of {name}", own=True)
-        yield Use(SDO_ANSWER + self.node_id, f"SDO answers of {name}", own=True)
+        yield Use(SDO_ANSWER + self.node_id, f"SDO responses of {name}", own=True)
         emergencies = self.emergencies
         if not emergencies.cob_id & INVALID_BIT:
             yield Use(emergencies.cob_id & 0x7FF, f"emergencies of {name}", emergencies, own=True)

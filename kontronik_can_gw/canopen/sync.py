@@ -21,9 +21,9 @@ class SyncTransmission:
 
     ``status`` counts the PDOs that a newer one replaced.
 
-    Several SYNCs may be read in one turn of the loop, after a delay. With type 1 the newest PDO
-    replaces the earlier ones of that turn. With types 2 to 240 every PDO is sent, one for each call
-    of ``advance``, so that each carries the values of its own turn.
+    Several SYNCs may be read in one iteration of the loop, after a delay. With type 1 the newest
+    PDO replaces the earlier ones of that iteration. With types 2 to 240 every PDO is sent, one for
+    each call of ``advance``, so that each carries the values of its own iteration.
     """
 
     def __init__(self, slot: Slot, status: GatewayStatus) -> None:

@@ -75,7 +75,7 @@ def _arrival(entry: Entry) -> int:
 
 
 def _write_advance(now: int, with_core: bool = True) -> Recorded | None:
-    return Recorded(now) if with_core else None  # turns in C record their own calls
+    return Recorded(now) if with_core else None  # iterations in C record their own calls
 
 
 def _write_flag(now: int, flag: bool = True) -> Recorded:

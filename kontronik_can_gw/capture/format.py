@@ -1,7 +1,7 @@
 """The capture file (.kcap): data from the ESCs and the bus, with times. Pure.
 
 A file is a sequence of blocks. Each block is written at once and can be read without the others: a
-loss of power destroys only the last block, and damage destroys only the blocks that it hits. All
+power loss destroys only the last block, and damage destroys only the blocks that it hits. All
 numbers are little-endian. A block::
 
     4 bytes  "KCB1"

@@ -96,12 +96,12 @@ class RecordedGateway(_Recorder):
         self._put(now, EntryKind.NOT_SENT, 0, b"", 0, None)
 
     def prepare_turns(self, now: int) -> None:
-        """Record counters and line errors before turns in C call the core."""
+        """Record counters and line errors before iterations in C call the core."""
         self._note_line_errors(now)
         self._note_counters(now)
 
     def turned(self, calls: Iterable[Call], frames: int) -> None:
-        """Record the calls of the core by turns in C. ``frames``: number of frames taken."""
+        """Record the calls of the core by iterations in C. ``frames``: number of frames taken."""
         self.recorded_counters = _with_sent(self.recorded_counters, frames)
         for now, kind, esc, data, came in calls:
             self._put(now, kind, esc, data, 0, came)

@@ -212,7 +212,7 @@ class Replay:
 def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:
     """Return the frames of one turn in the order in which they are passed to the interface.
 
-    ``waiting`` is the transmit queue, the same one for each turn.
+    ``waiting`` is the transmit queue, the same one for each iteration.
     """
     waiting.put_all(frames)
     return waiting.take_all()

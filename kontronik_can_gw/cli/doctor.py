@@ -52,10 +52,11 @@ OPTIONS = (
     CONFIG,
     (
         JSON,
-        option("--parcel FILE", "write a zip file for support, without passwords and keys"),
+        option("--bundle FILE", "write a zip file for support, without passwords and keys"),
+        option("--parcel FILE", argparse.SUPPRESS, dest="bundle"),  # the name until 0.6.0
     ),
-    option("--without-captures", "leave captures out of the parcel"),
-    option("--without-dbc", "leave the DBC out of the parcel, also out of its captures"),
+    option("--without-captures", "leave captures out of the bundle"),
+    option("--without-dbc", "leave the DBC out of the bundle, also out of its captures"),
     FORCE,
 )
 EPILOG = (
@@ -65,19 +66,19 @@ EPILOG = (
     "service's user "
     "(sudo -u kontronik-can-gw). Root sees more. "
     "Exit codes: 0 no error, perhaps warnings; 1 errors; 2 the configuration cannot be used. "
-    "With --parcel: 0 the file was written, 1 it was not."
+    "With --bundle: 0 the file was written, 1 it was not."
 )
 
 
 def main(args: argparse.Namespace) -> int:
     machine = Machine()
-    if args.parcel is not None:
-        from kontronik_can_gw.cli.parcel import write_parcel
+    if args.bundle is not None:
+        from kontronik_can_gw.cli.bundle import write_bundle
 
-        # support needs the parcel even if there is no configuration
+        # support needs the bundle even if there is no configuration
         config = args.config or default_config() or CONFIG_PLACES[-1]
         findings, _ = examine(machine, config)
-        return write_parcel(args, machine, config, findings, report_lines)
+        return write_bundle(args, machine, config, findings, report_lines)
     config = config_file(args.config)
     findings, code = examine(machine, config)
     if args.json:

@@ -63,7 +63,7 @@ class DbcConfig:
         "name of a message = its AUTOSAR E2E profile; '*' stands for any characters, and an exact "
         "name has priority (default: the profile that the DBC's attributes state)")
     e2e_data_ids: Mapping[str, int | Sequence[int]] = key(table_of(_DATA_IDS), {},
-        "name of a message = its AUTOSAR E2E data id, or a list of 16 for profiles 2 and 22 "
+        "name of a message = its AUTOSAR E2E data ID, or a list of 16 with profiles 2 and 22 "
         "(default: the DBC's attribute; profile 1A: the CAN id)")
     units: Mapping[str, str] = key(meanings(units.names()), {},
         "unit text in the DBC = the unit that is meant, "
@@ -112,7 +112,7 @@ class DronecanConfig:
 
     enabled: bool = key(BOOLEAN, False, "report the ESCs over DroneCAN")
     node_id: int = key(integer(0, 125), 0,
-        "node-ID of the first node. The others count up from it. 0: an allocator on the bus, "
+        "node-ID of the first node. The others count up from it. 0: a server on the bus, "
         "for example ArduPilot or PX4, assigns all node-IDs")
     per_esc_nodes: bool = key(BOOLEAN, False,
         "run a node for each ESC instead of one for the gateway")

@@ -4,7 +4,7 @@ Arrival times. ``since`` of a read is a time at which none of its bytes had arri
 follow one another on the wire. So byte k of a read (1, 2, ...) arrived no earlier than ``since``
 plus k - 1 byte times. This time is called the bound.
 
-1. Time-outs count from the bound. So no value outlives its time-out, however late it is read.
+1. Timeouts count from the bound. So no value outlives its timeout, however late it is read.
 2. Ages, energy and run time count from the estimated arrival. It is the time of the read minus the
    wire time of the bytes after the frame. If this estimate is later than the bound by more than the
    usual interval between frames, they count from the bound, too. So an age is shown at most one
@@ -113,7 +113,7 @@ class EscStream(EscTelemetry):
         Yields the events of one frame after another; meanwhile the state is the state after that
         frame. Iterate to the end, otherwise the remaining frames are lost. Call ``expire`` first:
         this method does not drop values that are too old at ``now``. A pending part of a frame is
-        given up if it is older than the time-out.
+        given up if it is older than the timeout.
         """
         decoder = self.decoder
         arrivals = self._arrivals
@@ -140,7 +140,7 @@ class EscStream(EscTelemetry):
             form, offset, _ = reading
             after_ns = (end - offset - form.length) * byte_ns
             if now - bound + after_ns > (INFO_TIMEOUT_NS if form.is_info else timeout):
-                # More bytes followed it in the same read than its time-out permits.
+                # More bytes followed it in the same read than its timeout permits.
                 self.late_frames += 1
             else:
                 yield self.accept(reading, shown - after_ns, bound - after_ns)

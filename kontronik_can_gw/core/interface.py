@@ -3,7 +3,7 @@
 There are two implementations with the same behaviour: ``core.python_core.PythonCore`` and, in C,
 ``native.core.NativeCore``. A core holds the telemetry of each ESC, the messages of a layout and
 their schedule. ``receive`` decodes and marks messages as pending, ``advance`` lets cycles and
-time-outs pass, and ``take`` packs the pending messages. ``now`` is integer nanoseconds of one
+timeouts pass, and ``take`` packs the pending messages. ``now`` is integer nanoseconds of one
 monotonic clock.
 """
 
@@ -32,7 +32,7 @@ class Place(NamedTuple):
 
     alive: int
     page: int
-    """Index of the next page."""
+    """Index of the next group."""
     sent_ns: int
     """Time of the last frame. -1: none was sent."""
     deferred_until: int
@@ -52,7 +52,7 @@ class Core(Protocol):
     link_changes: list[int]
     """ESCs whose link state, layout or device changed. The owner empties the list."""
     shortest_timeout_ns: int
-    """The shortest time-out of all ESCs, after which live data are not available."""
+    """The shortest timeout of all ESCs, after which live data are not available."""
 
     @property
     def escs(self) -> Sequence[EscTelemetry]:
@@ -134,7 +134,7 @@ class Core(Protocol):
         """
 
     def stop(self, now: int) -> None:
-        """Mark the messages with values of the gateway, all pages, without minimum distances."""
+        """Mark the messages with values of the gateway, all groups, without minimum delay times."""
 
     @property
     def is_pending(self) -> bool:

@@ -3,7 +3,7 @@
 Events of ESCs (``on_event``) and time (``advance``) mark messages as pending. ``take`` packs the
 pending messages with the values of that moment, so the newest value wins. In one step a message
 is sent at most once. The order is that of the times at which the messages became due, then of
-their index. Messages with the same cycle are spread evenly over it. The minimum distance of a
+their index. Messages with the same cycle are spread evenly over it. The minimum delay time of a
 message is always kept.
 """
 
@@ -24,7 +24,7 @@ _CYCLE = 1
 _REQUEST = 2
 """Why a message is pending. It is always sent for its cycle, and for a request if it has news."""
 _MIN_DISTANCE_NS = MS
-"""Minimum distance between frames of a message that are not caused by an event."""
+"""Minimum time between frames of a message that are not caused by an event."""
 _EVENT_OF_PACE = {
     Group.LIVE: Event.LIVE,
     Group.INFO: Event.INFO,
@@ -40,7 +40,7 @@ class Traits:
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         self.is_paged = len(plan.pages) > 1
-        # Without a cycle, a minimum distance and further pages, time never makes it pending.
+        # Without a cycle, a minimum delay time and further groups, time never makes it pending.
         self.is_untimed = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
         # Messages with the state of the link are always sent.
         self.is_silent_on_loss = (
@@ -99,10 +99,10 @@ class _Message(Traits):
         self.frame = compile_frame(plan)
         self.place = 0
         self.pages_to_send: set[int] = set()
-        """Places of pages that are sent next, without another event."""
+        """Places of groups that are sent next, without another event."""
         self.alive = 0
         self.last: dict[int, CanFrame] = {}
-        """If it is sent on change: the last frame of each page, with alive counter 0."""
+        """If it is sent on change: the last frame of each group, with alive counter 0."""
         self.why = 0
         self._sent_ns = -NEVER
         self._cycle_due = first_cycle if plan.cycle_ns else NEVER
@@ -115,16 +115,16 @@ class _Message(Traits):
         return min(self._cycle_due, self._deferred_until)
 
     def may_go(self, now: int) -> bool:
-        """Return True if the minimum distance to its last frame is over."""
+        """Return True if the minimum delay time to its last frame is over."""
         return now >= self._sent_ns + self.plan.delay_ns
 
     def defer(self) -> None:
-        """Delay it until its minimum distance is over."""
+        """Delay it until its minimum delay time is over."""
         if self._deferred_until == NEVER:
             self._deferred_until = self._sent_ns + self.plan.delay_ns
 
     def sent(self, now: int) -> None:
-        """Note that a frame of it was sent. Only further pages remain to be sent."""
+        """Note that a frame of it was sent. Only further groups remain to be sent."""
         self._sent_ns = now
         self._cycle_deferred = False
         distance = max(self.plan.delay_ns, _MIN_DISTANCE_NS)
@@ -133,7 +133,7 @@ class _Message(Traits):
     def take_due(self, now: int) -> tuple[int, int]:
         """Return the time at which it became due and the reasons, or NEVER and 0.
 
-        A cycle within the minimum distance is returned when the distance is over. A late call skips
+        A cycle within the minimum delay time is returned when that time is over. A late call skips
         missed cycles.
         """
         when = NEVER
@@ -185,20 +185,20 @@ class _Message(Traits):
         return bool(self.triggers & events)
 
     def add_all_pages(self) -> None:
-        """Send all pages, if there are several."""
+        """Send all groups, if there are several."""
         if self.is_paged:
             self.pages_to_send.update(range(len(self.plan.pages)))
 
     def turn_page(self) -> None:
-        """Send the next page, if there are several."""
+        """Send the next group, if there are several."""
         if self.is_paged:
             self.pages_to_send.add(self.place)
             self.place = (self.place + 1) % len(self.plan.pages)
 
     def take_place(self) -> int:
-        """Return the place of the page to send, and remove it from those to send.
+        """Return the place of the group to send, and remove it from those to send.
 
-        It is the first of them, counted from the page whose turn is next.
+        It is the first of them, counted from the group whose turn is next.
         """
         if not self.is_paged:
             return 0
@@ -282,7 +282,7 @@ class Messages:
             return
         state = self._escs[esc]
         up = state.live is not None
-        # Live or info data have ended. No later event sends the remaining pages.
+        # Live or info data have ended. No later event sends the remaining groups.
         has_ended = not up or (events & Event.INFO and state.info is None)
         for message in self._of_esc[esc]:
             if message.follows(events, up):
@@ -315,7 +315,7 @@ class Messages:
                 self._request(message, now)
 
     def stop(self, now: int) -> None:
-        """Send the messages with the gateway's own state at once, all pages, at any distance."""
+        """Send the messages with the gateway's own state at once, all groups, at any distance."""
         if not self._quiet:
             self._stopping = True
             self._send_last(now)
@@ -337,21 +337,21 @@ class Messages:
         self.repeat(now)
 
     def _send_last(self, now: int) -> None:
-        """Send the messages with the gateway's own state at once, all pages, at any distance."""
+        """Send the messages with the gateway's own state at once, all groups, at any distance."""
         for message in self._of_gateway:
             if message.by_event:
                 message.add_all_pages()
             self._mark_pending(message, now, _REQUEST)
 
     def advance(self, now: int) -> None:
-        """Mark messages whose cycle or minimum distance is over."""
+        """Mark messages whose cycle or minimum delay time is over."""
         for message in self._timed:
             when, why = message.take_due(now)
             if why:
                 self._mark_pending(message, when, why)
 
     def _request(self, message: _Message, now: int) -> None:
-        """Send a message as soon as its minimum distance allows."""
+        """Send a message as soon as its minimum delay time allows."""
         if message.may_go(now):
             self._mark_pending(message, now, _REQUEST)
         elif self._note_news(message, now):
@@ -396,7 +396,7 @@ class Messages:
         return frames
 
     def _prepare(self, message: _Message, why: int, now: int) -> bool:
-        """Return True if a pending message is sent, and choose its pages.
+        """Return True if a pending message is sent, and choose its groups.
 
         They are the changed ones if it was requested, and the next one if its cycle is over.
         """
@@ -413,7 +413,7 @@ class Messages:
     def _note_news(self, message: _Message, now: int) -> bool:
         """Return False if a message is sent on change and has not changed.
 
-        Changed pages are added to ``pages_to_send``.
+        Changed groups are added to ``pages_to_send``.
         """
         if message.by_event or not message.on_change:
             return True
@@ -427,7 +427,7 @@ class Messages:
         return bool(changed or message.pages_to_send)
 
     def _frame(self, message: _Message, now: int) -> CanFrame:
-        """Return the frame of the next page, and note that it was sent."""
+        """Return the frame of the next group, and note that it was sent."""
         place = message.take_place()
         frame = message.frame(self._escs, self._gateway, now, message.alive, place)
         if message.on_change:

@@ -13,7 +13,7 @@ or by its timer if there is no event. So the average distance is the mean of inh
 It pauses while its first signal is not available.
 
 A slot with a ``seed`` sends transfers (signals/transfer.py). Slots with the same id share one
-transfer number.
+transfer ID.
 """
 
 from collections.abc import Sequence
@@ -67,7 +67,7 @@ class SlotSettings(NamedTuple):
     fill: int = 0
     """Bits that the owner sets in addition to the signals of the plan."""
     page: int = 0
-    """Page of its frame (frames.CanFrame), or of the first frame of a transfer."""
+    """Group of its frame (frames.CanFrame), or of the first frame of a transfer."""
 
 
 class Slot(Protocol):
@@ -130,7 +130,7 @@ class PythonSlot:
         """The events for which ``on_event`` must be called."""
         self.can_id = 0
         self.transfer_id = 0
-        """The next transfer number of this id, in the first slot with it."""
+        """The next transfer ID of this id, in the first slot with it."""
         self._owner = owner
         self._esc = esc
         self._escs = (owner.escs[esc],)

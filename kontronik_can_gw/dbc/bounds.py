@@ -1,8 +1,8 @@
 """Checks the numbers in a DBC before cantools reads it.
 
 Without these limits a single number could cost gigabytes of memory or a minute. cantools makes an
-object for each page of a multiplexer, builds masks of one character per bit, and expands ranges. It
-uses numbers only after it has parsed the whole file, so the patterns need to be exact only for
+object for each group of a multiplexer, builds masks of one character per bit, and expands ranges.
+It uses numbers only after it has parsed the whole file, so the patterns need to be exact only for
 well-formed text.
 """
 
@@ -118,14 +118,14 @@ class _Multiplexing:
     name: str
     multiplexers: set[str] = field(default_factory=set)
     values: Counter[str] = field(default_factory=Counter)
-    """Number of pages of each signal."""
+    """Number of groups of each signal."""
     parents: dict[str, str] = field(default_factory=dict)
     """The multiplexer of a signal in SG_MUL_VAL_."""
     texts: Counter[str] = field(default_factory=Counter)
-    """Sizes of value tables. Each text in a multiplexer's table makes a page."""
+    """Sizes of value tables. Each text in a multiplexer's table makes a group."""
 
     def pages(self) -> tuple[int, int]:
-        """Return the nesting depth of multiplexers, and the number of pages and signals on them."""
+        """Return the nesting depth of multiplexers, and the number of their groups and signals."""
         depth = 0
         total = 0
         for name in self.multiplexers | self.values.keys():

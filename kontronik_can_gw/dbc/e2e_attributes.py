@@ -41,7 +41,7 @@ class UnclearAttribute(ValueError):
 def profile_of(message: "Message", database: "Database") -> Profile | None:
     """Return the profile that the DBC states for a message, or None.
 
-    A default value applies only to a message that has its own data id. Raises UnclearAttribute if
+    A default value applies only to a message that has its own data ID. Raises UnclearAttribute if
     the profile is not supported.
     """
     found = _values(message, database, _PROFILE)

@@ -1,4 +1,4 @@
-"""Compiles one message of a DBC: frame, timing, pages, signals and E2E protection."""
+"""Compiles one message of a DBC: frame, timing, groups, signals and E2E protection."""
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -121,7 +121,7 @@ def _too_many_pages(message: "Message", count: int) -> str | None:
 
 
 def _signals(job: Compilation, copy: Copy, protection: Protection | None) -> list[SignalPlan]:
-    """Return the plans of a message's signals. A signal on several pages has one for each page."""
+    """Return the plans of a message's signals. A signal in several groups has one for each."""
     plans = []
     for signal in copy.message.signals:
         if signal.length > copy.message.length * 8:
@@ -185,7 +185,7 @@ def _timing(
     message: "Message",
     where: str,
 ) -> tuple[SendType, int, int]:
-    """Return send type, cycle time and minimum distance in ns."""
+    """Return send type, cycle time and minimum delay time in ns."""
     cycle = 0
     # the last two are for messages that are sent only in an active state; here they always are
     for attribute_name in ("GenMsgCycleTime", "GenMsgCycleTimeFast", "GenMsgCycleTimeActive"):

@@ -85,7 +85,7 @@ def likely_protection(name: str) -> Role | None:
 
 
 def is_data_id(name: str) -> bool:
-    """Return True if a signal's name or binding means 4 bits of an E2E data id."""
+    """Return True if a signal's name or binding means 4 bits of an E2E data ID."""
     return normalize(name).endswith(("dataid", "dataidnibble"))
 
 

@@ -197,7 +197,7 @@ def _data_id_problems(
 ) -> Iterator[str]:
     key = f"dbc.e2e_data_ids.{copy.name}"
     example = f"{key} = [1, 2, …]" if profile.ids > 1 else f"{key} = 0x123"
-    needed = f"{DATA_IDS} data ids, one for each counter" if profile.ids > 1 else "one data id"
+    needed = f"{DATA_IDS} data IDs, one for each counter" if profile.ids > 1 else "one data ID"
     if len(data_ids) != profile.ids:
         found = f"has {len(data_ids)}" if data_ids else "has none"
         yield f"{where}: E2E profile {profile.name} needs {needed}; it {found}. Set {example}."
@@ -205,7 +205,7 @@ def _data_id_problems(
     for data_id in data_ids:
         if data_id > profile.largest_id:
             yield (
-                f"{where}: the data id 0x{data_id:X} is too large for E2E profile {profile.name}, "
+                f"{where}: the data ID 0x{data_id:X} is too large for E2E profile {profile.name}, "
                 f"at most 0x{profile.largest_id:X}. Set {example}."
             )
             return
@@ -354,7 +354,7 @@ def _fit_problems(
     nibbles = [signal for signal in signals if signal.role is Role.DATA_ID]
     if profile.mode is DataIdMode.NIBBLE and len(nibbles) != 1:
         yield (
-            f"{where}: {title} sends 4 bits of the data id, but no signal is known to contain "
+            f"{where}: {title} sends 4 bits of the data ID, but no signal is known to contain "
             'them. Bind it: dbc.bind.SIGNAL = "data_id".'
         )
     for nibble in nibbles:

@@ -52,7 +52,7 @@ class Compilation:
 
 
 class SignalCompiler:
-    """Makes the plans of one signal. A signal has a plan for each of its pages."""
+    """Makes the plans of one signal. A signal has a plan for each of its groups."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class SignalCompiler:
             self.start_raw = raw_values.constant(signal, self.start, Fraction(1), Fraction(0))
 
     def plan(self, page: int | None) -> SignalPlan | None:
-        """Return the plan on a page. None if it cannot be sent, with a line in the problems."""
+        """Return the plan on a group. None if it cannot be sent, with a line in the problems."""
         try:
             self._check()
             return self._with_source(self._without_source(page))
@@ -275,7 +275,7 @@ class SignalCompiler:
         return f"no such source.{hints} Bind it under [dbc.bind] or rename it."
 
     def _is_data_id(self, name: str) -> bool:
-        """Return True if the signal contains a part of the data id of an E2E profile."""
+        """Return True if the signal contains a part of the data ID of an E2E profile."""
         if self.protection is None or self.protection.profile.mode is not DataIdMode.NIBBLE:
             return False
         return names.is_data_id(name)

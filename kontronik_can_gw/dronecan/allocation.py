@@ -1,8 +1,8 @@
-"""Asks an allocator on the bus for the node-ID of one node at a time (specification, 6.6).
+"""Asks an allocation server on the bus for the node-ID of one node at a time (specification, 6.6).
 
-The unique id is sent in three anonymous requests. Each further one is sent after the allocator has
-repeated the parts before it. A client that receives the request of another client starts again
-later. Random numbers are generated from a seed, so that a replay sends at the same times.
+The unique id is sent in three anonymous requests. Each further one is sent after the allocation
+server has repeated the parts before it. A client that receives the request of another client starts
+again later. Random numbers are generated from a seed, so that a replay sends at the same times.
 """
 
 from kontronik_can_gw.dronecan.wire import ALLOCATION, LOW, MAX_NODE_ID, anonymous_id
@@ -34,7 +34,7 @@ class Allocation:
         self._random_state = seed
         self._unique_id = b""
         self._confirmed = 0
-        """Number of bytes of the unique id that the allocator has repeated."""
+        """Number of bytes of the unique id that the allocation server has repeated."""
         self._transfer_id = 0
 
     def ask(self, unique_id: bytes, now: int) -> None:
@@ -62,7 +62,7 @@ class Allocation:
     ) -> int | None:
         """Process an Allocation message. Returns the node-ID that was allocated to us, or None.
 
-        ``source`` is the allocator's node-ID, or 0 if the message is the request of another
+        ``source`` is the allocation server's node-ID, or 0 if the message is the request of another
         client. A node-ID in ``taken`` is refused.
         """
         if self.due == NEVER:

@@ -7,7 +7,7 @@ class DronecanNodeSetup(NamedTuple):
     """The settings of one node."""
 
     node_id: int
-    """0 if an allocator chooses it."""
+    """0 if an allocation server chooses it."""
     name: str
     unique_id: bytes
     escs: tuple[int, ...]

@@ -32,7 +32,7 @@ Parameter = int | float | str
 MAX_ANSWERS = 50
 """Maximum number of answers in a second, so that requests cannot keep the bus busy."""
 _ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
-"""Ids of Allocation messages: those of an allocator, and the requests of other clients."""
+"""Ids of Allocation messages: those of an allocation server, and the requests of other clients."""
 
 
 class DronecanNode:

@@ -68,8 +68,8 @@ class DronecanSetup(OutputSetup):
     def _unique_id(self, name: str) -> bytes:
         """Return the unique id of a node, which is always the same for this machine and name.
 
-        The unique ids of other nodes differ already in the first bytes, because an allocator is
-        asked with a part of the id.
+        The unique ids of other nodes differ already in the first bytes, because an allocation
+        server is asked with a part of the id.
         """
         machine = self.given.identity
         name_bytes = name.encode()
@@ -92,7 +92,7 @@ class DronecanSetup(OutputSetup):
         While a node-ID is unknown, these are all ids.
         """
         if not self.given.table.node_id:
-            return {id_block(0, 0): "DroneCAN, because an allocator may assign any node-ID"}
+            return {id_block(0, 0): "DroneCAN, because an allocation server may assign any node-ID"}
         found = {}
         for node in self.nodes:
             user = f"DroneCAN node {node.node_id} (bits 0 to 6 of its ids)"
@@ -178,7 +178,7 @@ class DronecanSetup(OutputSetup):
 
 
 def _node_id_text(node: DronecanNodeSetup) -> str:
-    return f"node {node.node_id}" if node.node_id else "node-ID from an allocator"
+    return f"node {node.node_id}" if node.node_id else "node-ID from an allocation server"
 
 
 def configured(config: Config, machine: HostMachine) -> DronecanSetup:

@@ -36,7 +36,7 @@ class LinkState(IntEnum):
     DEGRADED = 3
     """Live data is fresh, but too many bytes or frames are bad."""
     LOST = 4
-    """Live data is older than the time-out."""
+    """Live data is older than the timeout."""
     PORT_ERROR = 5
     """The serial port is not open."""
 
@@ -122,7 +122,7 @@ class EscTelemetry:
     suspect_frames: int = 0
     """Live frames with an impossible value outside their checksum."""
     late_frames: int = 0
-    """Frames that were already older than their time-out when they were complete."""
+    """Frames that were already older than their timeout when they were complete."""
     energy_mw_ns: int = 0
     """Energy drawn from the battery. Recovered energy is not subtracted."""
     run_time_ns: int = 0
@@ -135,7 +135,7 @@ class EscTelemetry:
     last_info_ns: int | None = None
     """The same time of the newest info frame."""
     live_bound_ns: int = 0
-    """Earliest possible arrival of the newest live frame's last byte. Time-outs count from it."""
+    """Earliest possible arrival of the newest live frame's last byte. Timeouts count from it."""
     info_bound_ns: int | None = None
     """The same time of the newest info frame. None unless ``info`` is fresh."""
     line_errors: int = 0

@@ -181,7 +181,7 @@ def scaled(
     count: int | None,
     slope: Fraction,
 ) -> int | None:
-    """Return ``count`` steps x ``slope`` / divisor, rounded once to a whole number, halves up.
+    """Return ``count`` steps x ``slope`` / divisor, rounded once to a whole number, half up.
 
     None if the steps or the divisor are not available.
     """

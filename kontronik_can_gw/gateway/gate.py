@@ -183,7 +183,7 @@ class Gate(GateState):
         look_due: int,
         now: int,
     ) -> None:
-        """Take over the frames of turns in C: see ``UnderWay.adopt``."""
+        """Take over the frames of iterations in C: see ``UnderWay.adopt``."""
         self.under_way.count = count
         self.under_way.adopt(accepted, older, newer, checked, now)
         self.still_since = still_since

@@ -211,7 +211,7 @@ class Gateway(FrameSource):
             output.held_up(now)
 
     def advance(self, now: int, with_core: bool = True) -> None:
-        """Let time pass: time-outs and cyclic messages.
+        """Let time pass: timeouts and cyclic messages.
 
         ``with_core`` is False if the core in C has advanced by itself.
         """

@@ -1,6 +1,6 @@
 """Frames that wait to be sent.
 
-For each CAN id and multiplexer page the newest frame wins. A frame with the flag ``queued``, such
+For each CAN id and multiplexer group the newest frame wins. A frame with the flag ``queued``, such
 as an answer of a CANopen node, is never replaced.
 """
 
@@ -37,8 +37,8 @@ class Sent(Enum):
 class TransmitQueue:
     """Frames that wait to be sent. Its twin is ``put`` and ``hand_over`` of native/linux.c.
 
-    1. A frame that is not ``queued`` replaces the waiting frame of its id and page, and keeps that
-       frame's place. Frames of further pages that wait behind it move up first, because the frames
+    1. A frame that is not ``queued`` replaces the waiting frame of its id and group, and keeps that
+       frame's place. Frames of further groups that wait behind it move up first, because the frames
        of a message share one alive counter, which must not run backward. If a frame belongs to a
        transfer and the older transfer of its id is half sent, it is discarded instead.
     2. Frames of a step are sent in the order of ``put_all``: outputs, then slots, then messages.
@@ -51,7 +51,7 @@ class TransmitQueue:
         self._waiting: dict[tuple[int, ...], CanFrame] = {}
         """The frames in the order of ``put_all``. The key of a queued frame is a unique number.
 
-        The key of any other frame is its id and page.
+        The key of any other frame is its id and group.
         """
         self._queued = 0
         """Number of queued frames in ``_waiting``."""
@@ -113,9 +113,9 @@ class TransmitQueue:
         return dropped
 
     def _move_up_pages(self, frame: CanFrame) -> None:
-        """Give the waiting frame of an id and page the last place of the message's pages.
+        """Give the waiting frame of an id and group the last place of the message's groups.
 
-        The pages behind it move up. Nothing changes if it does not wait, or is the last one.
+        The groups behind it move up. Nothing changes if it does not wait, or is the last one.
         """
         own = _key_of(frame)
         if frame.page >= FIRST_PART or own not in self._waiting:
@@ -136,7 +136,7 @@ class TransmitQueue:
         """Return True if a frame belongs to a transfer whose predecessor is half sent.
 
         The first part of the predecessor is no longer in the queue, but later parts still wait. The
-        parts of a transfer have ``PARTS`` consecutive pages.
+        parts of a transfer have ``PARTS`` consecutive groups.
         """
         if frame.page < FIRST_PART:
             return False

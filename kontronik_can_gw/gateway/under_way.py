@@ -55,7 +55,7 @@ class UnderWay:
         return bool(moved)
 
     def adopt(self, accepted: int, older: int, newer: int, checked: int, now: int) -> None:
-        """Take over the frames of turns in C.
+        """Take over the frames of iterations in C.
 
         ``accepted`` frames were accepted since the last call. ``older`` and ``newer`` of all
         frames are under way, and were accepted before and after the check at ``checked``.

@@ -13,7 +13,7 @@
 enum {
     CYCLE = 1,   /* Its cycle is due. It is sent in any case. */
     REQUEST = 2, /* It was requested. It is sent if is_news returns 1. */
-    TURNED = 4   /* Its cycle is due, as with CYCLE, and the page of this cycle was chosen. */
+    TURNED = 4   /* Its cycle is due, as with CYCLE, and the group of this cycle was chosen. */
 };
 /* kcg.page. */
 enum {
@@ -459,7 +459,7 @@ static int close_window(kcg_esc *e, int64_t now, int64_t length)
         e->interval = length / frames;
     if (frames > KCG_MOST_FRAMES)
         frames = KCG_MOST_FRAMES;
-    e->rate = (int32_t)((20 * SECOND * frames + length) / (2 * length)); /* halves up */
+    e->rate = (int32_t)((20 * SECOND * frames + length) / (2 * length)); /* half up */
     return KCG_SECOND | set_link(e, is_bad ? KCG_DEGRADED : KCG_OK);
 }
 
@@ -750,7 +750,7 @@ static uint64_t raw_of(const kcg *g, const kcg_signal *s, int64_t now, int alive
     return (uint64_t)v;
 }
 
-/* Packs a page of a message: its constant bits, then its signals. */
+/* Packs a group of a message: its constant bits, then its signals. */
 static void pack(const kcg *g, const kcg_message *m, int place, int64_t now, int alive,
                  uint64_t *bits)
 {
@@ -823,7 +823,7 @@ static void defer(kcg *g, uint32_t i, int64_t until)
     }
 }
 
-/* Returns 1 if the minimum distance to the last frame has passed. */
+/* Returns 1 if the minimum delay time to the last frame has passed. */
 static int may_go(const kcg *g, uint32_t i, int64_t now)
 {
     return now >= g->sending[i].last + g->plan->message[i].delay;
@@ -839,7 +839,7 @@ static void queue_page(kcg *g, uint32_t i, int place)
     *page |= TO_SEND;
 }
 
-/* Queues all pages of a message, if it has several. */
+/* Queues all groups of a message, if it has several. */
 static void queue_all_pages(kcg *g, uint32_t i)
 {
     int pages = PAGES_OF(&g->plan->message[i]);
@@ -852,7 +852,7 @@ static int page_after(const kcg_message *m, int place)
     return place + 1 < m->pages ? place + 1 : 0;
 }
 
-/* Queues the next page, and turns to the page after it. */
+/* Queues the next group, and turns to the group after it. */
 static void turn_page(kcg *g, uint32_t i)
 {
     kcg_sending *s = &g->sending[i];
@@ -860,7 +860,7 @@ static void turn_page(kcg *g, uint32_t i)
     s->page = (uint8_t)page_after(&g->plan->message[i], s->page);
 }
 
-/* Returns the page to be sent: the first queued page, counted from the next page on. */
+/* Returns the group to be sent: the first queued group, counted from the next group on. */
 static int next_of_pages(kcg *g, uint32_t i)
 {
     const kcg_message *m = &g->plan->message[i];
@@ -891,7 +891,7 @@ static void mark(kcg *g, uint32_t i, int64_t since, int why)
     s->why = (uint8_t)(s->why | why);
 }
 
-/* Returns 1 if a message that is sent on change has changed. Queues its changed pages. */
+/* Returns 1 if a message that is sent on change has changed. Queues its changed groups. */
 static int has_changed(kcg *g, uint32_t i, int64_t now)
 {
     const kcg_message *m = &g->plan->message[i];
@@ -917,7 +917,7 @@ static inline int is_news(kcg *g, uint32_t i, int64_t now)
     return !is_only_on_change || has_changed(g, i, now);
 }
 
-/* Requests a message: at once, or as soon as its minimum distance allows. */
+/* Requests a message: at once, or as soon as its minimum delay time allows. */
 static void request(kcg *g, uint32_t i, int64_t now)
 {
     if (may_go(g, i, now)) {
@@ -1159,7 +1159,7 @@ static void on_event(kcg *g, int esc, int events, int64_t now)
     if (is_quiet(g))
         return;
     /* Without live data, or when the info has just expired, there may be no later event that
-       requests the further pages. */
+       requests the further groups. */
     int has_lost_data = !e->has_live || (events & KCG_INFO && !e->has_info);
     for (int k = plan->first_listener[esc]; k < plan->first_listener[esc + 1]; k++) {
         uint32_t i = plan->listener[k];
@@ -1210,7 +1210,7 @@ void kcg_repeat(kcg *g, int64_t now)
     }
 }
 
-/* Requests the messages with values of the gateway, all pages, at any distance. */
+/* Requests the messages with values of the gateway, all groups, at any distance. */
 static void send_last(kcg *g, int64_t now)
 {
     for (uint32_t i = 0; i < g->plan->messages; i++) {
@@ -1243,7 +1243,7 @@ static void clear_pending(kcg *g)
         g->page[k] &= KNOWN;
 }
 
-/* Handles cycles and minimum distances that are due. */
+/* Handles cycles and minimum delay times that are due. */
 static void advance_messages(kcg *g, int64_t now)
 {
     while (g->heaped) {
@@ -1323,8 +1323,8 @@ static void make_frame(kcg *g, uint32_t i, int64_t now, kcg_frame *f)
     kcg_sending *s = &g->sending[i];
     uint64_t bits[WORDS];
     if (s->why & CYCLE && PAGES_OF(m) > 1) {
-        /* A cycle turns one page. If kcg_sent does not report the frame, it is packed again, and
-           must not turn a further page. So CYCLE becomes TURNED. */
+        /* A cycle turns one group. If kcg_sent does not report the frame, it is packed again, and
+           must not turn a further group. So CYCLE becomes TURNED. */
         s->why = REQUEST | TURNED;
         turn_page(g, i);
     }
@@ -1413,7 +1413,7 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max)
         g->taken += parts_of(m);
         g->pending[kept++] = (uint16_t)i;
         if (KCG_PAGED && (g->stopping || is_quiet(g)) && s->pages_to_send > 1) {
-            k++; /* its other pages are next */
+            k++; /* its other groups are next */
             break;
         }
     }

@@ -71,7 +71,7 @@ enum {
 /* A CAN frame with the same layout as SocketCAN's struct can_frame or canfd_frame. */
 typedef struct {
     uint32_t id; /* Bit 31 is set for a 29-bit id. */
-    /* page: index of the multiplexer's page. The bytes `page` and `reserved` are reserved in
+    /* page: index of the multiplexer's group. The bytes `page` and `reserved` are reserved in
        SocketCAN, and the kernel passes them on to other programs. So linux.c sends `page` as 0. */
     uint8_t length, flags, page, reserved;
     uint8_t data[KCG_DATA];
@@ -177,7 +177,7 @@ enum {
     KCG_SILENT_ON_LOSS = 4,  /* Not sent while all of its ESCs are without live data. */
     KCG_HAS_CRC = 8,         /* Has a CRC of AUTOSAR E2E protection at byte `crc_at`. */
     KCG_OF_THE_GATEWAY = 16, /* Has values of the gateway, and is sent by kcg_gateway_changed. */
-    KCG_FREE = 32,           /* Has neither cycle nor minimum distance, and one page. */
+    KCG_FREE = 32,           /* Has neither cycle nor minimum delay time, and one group. */
     KCG_TRANSFER = 64,       /* Slots only: several frames with a CRC-16, as in DroneCAN. */
     /* Slots only: a measurement at a rate. It is sent with the first event after `delay`, and after
        `cycle` without an event. The period on average is their mean. */
@@ -185,8 +185,8 @@ enum {
 };
 /* kcg_frame.page of the frames of transfers. */
 enum {
-    KCG_FIRST_PART = KCG_PAGES, /* The first page of a transfer. */
-    KCG_PARTS = 3               /* Consecutive pages of one transfer. */
+    KCG_FIRST_PART = KCG_PAGES, /* The first group of a transfer. */
+    KCG_PARTS = 3               /* Consecutive groups of one transfer. */
 };
 
 /* A part of a signal in a frame: `width` bits of the raw value from bit `shift` on, at bit `at` of
@@ -199,7 +199,7 @@ typedef struct { int64_t number; uint64_t raw; } kcg_pair;
    example its pole pairs times its gear. The raw value of an integer is value * mul / div +
    add / div, rounded down once: floor((x * mul * over + add * by) / (div * by)). */
 typedef struct {
-    /* kind: KCG_OF_... page: index of the page, or KCG_PAGES if the signal is on all pages.
+    /* kind: KCG_OF_... page: index of the group, or KCG_PAGES if the signal is on all groups.
        esc: number of the ESC, or 255 for a value of the gateway.
        shift, mask: select a part of the field. mask 0: the whole field. */
     uint8_t kind, wire, place, shift, flags, pieces, page, esc;
@@ -224,19 +224,19 @@ typedef struct {
     /* e2e: index into kcg_plan.e2e, with KCG_HAS_CRC. first_page: index into kcg.page.
        last_alive: highest value of the alive counter, which begins at 0. */
     uint16_t first_signal, signals, e2e, first_page, last_alive;
-    uint32_t first_word; /* Index into kcg_plan.constant, which has `words` for each page. */
+    uint32_t first_word; /* Index into kcg_plan.constant, which has `words` for each group. */
     uint32_t first_esc;  /* Index into kcg_plan.esc_of, which has `escs` numbers for the message. */
-    int64_t cycle, delay, phase; /* In ns. delay: minimum distance between two frames. */
+    int64_t cycle, delay, phase; /* In ns. delay: minimum delay time between two frames. */
 } kcg_message;
 enum { KCG_DATA_IDS = 16 };
 /* The CRC of a protected message (twin: signals/e2e.py). */
 typedef struct {
     /* A CRC of 8 bits is computed as one of 16 bits: these numbers are shifted by 8 bits. */
     uint16_t polynomial, start, final_xor;
-    /* crc_bytes: 1, or 2 with the low byte first. id_bytes: bytes of the data id in the CRC.
+    /* crc_bytes: 1, or 2 with the low byte first. id_bytes: bytes of the data ID in the CRC.
        is_id_last: 1: they follow the frame's bytes. 0: they precede them. */
     uint8_t crc_bytes, id_bytes, is_id_last, reserved;
-    uint16_t data_id[KCG_DATA_IDS]; /* The data id for each counter, modulo 16. */
+    uint16_t data_id[KCG_DATA_IDS]; /* The data ID for each counter, modulo 16. */
 } kcg_e2e;
 /* A slot, besides its kcg_message. */
 typedef struct {
@@ -319,13 +319,13 @@ typedef struct {
 typedef struct {
     uint16_t place_in_heap;
     uint16_t alive;         /* The alive counter. */
-    uint8_t page;           /* Index of the next page. */
-    uint8_t pages_to_send;  /* Number of pages that must be sent without a further event. */
-    uint8_t cycle_deferred; /* A cycle was due while the minimum distance did not allow a frame. */
+    uint8_t page;           /* Index of the next group. */
+    uint8_t pages_to_send;  /* Number of groups that must be sent without a further event. */
+    uint8_t cycle_deferred; /* A cycle was due before the minimum delay time allowed a frame. */
     uint8_t why;            /* Reasons why it is pending, or 0. */
     int64_t last;           /* Time of the last frame. */
     int64_t cycle_due;      /* Next cycle, or KCG_NEVER. */
-    int64_t deferred;       /* When the minimum distance allows the next frame, or KCG_NEVER. */
+    int64_t deferred;       /* When the minimum delay time allows the next frame, or KCG_NEVER. */
     int64_t since;          /* Time since which it is pending. */
 } kcg_sending;
 
@@ -355,7 +355,7 @@ typedef struct {
     kcg_esc *esc;
     kcg_sending *sending; /* For the messages, then for the slots. */
     kcg_slot *slot;
-    /* Bits of the last frame of each page, for messages that are sent on change. */
+    /* Bits of the last frame of each group, for messages that are sent on change. */
     uint64_t *last;
     uint8_t *page;   /* For each page: is its last frame known, must it be sent. */
     uint8_t *report; /* ESCs with events that were not yet returned, oldest first. */
@@ -430,10 +430,10 @@ enum { KCG_AGAIN = 1 << 30 };
    If the result has KCG_AGAIN, the bytes were not processed, because values expired before. Handle
    the events, then call kcg_receive again with the same bytes. With `mask` 0 this never happens. */
 int kcg_receive(kcg *g, int esc, const uint8_t *data, size_t size, int64_t now, int64_t since);
-/* Drops values that are older than their time-out. Returns an event. kcg_receive and kcg_advance do
+/* Drops values that are older than their timeout. Returns an event. kcg_receive and kcg_advance do
    the same. */
 int kcg_expire(kcg *g, int64_t now);
-/* Handles time-outs and cycles that are due. Returns an event. Call it at kcg_next_deadline. An
+/* Handles timeouts and cycles that are due. Returns an event. Call it at kcg_next_deadline. An
    early call does nothing. A late call skips missed cycles. */
 int kcg_advance(kcg *g, int64_t now);
 /* Reports that the port of an ESC is unusable (is_open 0) or usable again (is_open 1). Returns an
@@ -464,7 +464,7 @@ uint32_t kcg_take(kcg *g, int64_t now, kcg_frame *frames, uint32_t max);
    are packed again with newer values. The rest of a transfer that was sent in part is dropped. */
 void kcg_sent(kcg *g, int64_t now, uint32_t count);
 #if KCG_SLOTS
-/* Slots (twin: core/slots.py) are messages that their owner starts and stops. A slot has one page,
+/* Slots (twin: core/slots.py) are messages that their owner starts and stops. A slot has one group,
    one ESC and at most 8 bytes (a transfer: 16 bytes, with KCG_DATA 64). `cycle` counts from the
    last frame.
    slot: a number from 0, less than kcg_plan.slots.
@@ -477,7 +477,7 @@ void kcg_slot_changed(kcg *g, uint32_t slot, int64_t now);
 void kcg_slot_stop(kcg *g, uint32_t slot);
 /* Reports that the content has changed without an event of the ESC. Ignored while it is stopped. */
 void kcg_slot_news(kcg *g, uint32_t slot, int64_t now);
-/* Requests a frame regardless of the minimum distance. Ignored while it is stopped. */
+/* Requests a frame regardless of the minimum delay time. Ignored while it is stopped. */
 void kcg_slot_send(kcg *g, uint32_t slot, int64_t now);
 /* Return whether the content has changed since the last frame, whether a frame is pending, and the
    number of frames sent. */

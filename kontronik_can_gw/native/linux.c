@@ -218,7 +218,7 @@ static void watch_room(kcg_turns *t, int is_full)
     t->queue.is_full = (uint32_t)is_full;
 }
 
-/* Returns the index of the waiting frame with this id and page, or q->count (twin:
+/* Returns the index of the waiting frame with this id and group, or q->count (twin:
    TransmitQueue). Frames of outputs are left out. */
 static uint32_t waiting_at(const kcg_turn_queue *q, uint32_t id, uint32_t page)
 {
@@ -243,7 +243,7 @@ static int has_begun(const kcg_turn_queue *q, const kcg_frame *made)
     return waiting > 0;
 }
 
-/* Lets a frame wait. It replaces an older frame with the same id and page (twin: TransmitQueue). */
+/* Lets a frame wait. It replaces an older frame of the same id and group (twin: TransmitQueue). */
 static void put(kcg_turns *t, const kcg_frame *made)
 {
     kcg_turn_queue *q = &t->queue;
@@ -253,7 +253,7 @@ static void put(kcg_turns *t, const kcg_frame *made)
     if (is_late)
         return;
     q->count += i == q->count;
-    /* Pages of the message that wait behind it move up, so that its counter does not run back. */
+    /* Groups of the message that wait behind it move up, so that its counter does not run back. */
     for (uint32_t k = i + 1; k < q->count && made->page < KCG_FIRST_PART; k++)
         if (q->frame[k].id == made->id) {
             q->frame[i] = q->frame[k];

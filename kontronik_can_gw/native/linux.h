@@ -12,7 +12,7 @@ enum {
     KCG_READ = 4096,    /* Bytes of one read. */
     KCG_RING = 1 << 18, /* Bytes that can be recorded in one run. */
     KCG_FDS = 1024,     /* Descriptors that are watched. */
-    KCG_AT_ONCE = 64,   /* Ports served in one turn; frames given to the kernel in one call. */
+    KCG_AT_ONCE = 64,   /* Ports served in one iteration; frames given to the kernel in one call. */
     KCG_SETTINGS = 64   /* Bytes of a copy of struct termios. */
 };
 

@@ -160,7 +160,7 @@ class _IntegerScale:
         self._signal = signal
         self._value = value
         self._low, self._high = _range(row, value)
-        self._intercept = signal.intercept + _HALF  # halves are rounded up
+        self._intercept = signal.intercept + _HALF  # a half is rounded up
 
     def exact(self) -> Scale | None:
         """Return the exact numbers, or None if a product can leave 64 bits with any settings."""

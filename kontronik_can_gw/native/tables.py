@@ -96,7 +96,7 @@ class Tables:
                     self.listeners_of[esc].append(index)
         most = max(len(self.signals), self.pages, len(self.listeners))
         if most > MAX_ROWS:
-            raise NotInCore(f"too many signals ({len(self.signals)}) or pages ({self.pages})")
+            raise NotInCore(f"too many signals ({len(self.signals)}) or groups ({self.pages})")
 
     @property
     def names(self) -> dict[str, list[str]]:

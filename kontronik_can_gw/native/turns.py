@@ -1,4 +1,4 @@
-"""Whole turns of the loop in C (linux.c), through ctypes.
+"""Whole iterations of the loop in C (linux.c), through ctypes.
 
 The structures are those of linux.h, which describes their fields.
 """

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.system.clock import ClockWatch
 
 _WAKES_PER_TIMEOUT = 4
-"""Number of times that the loop wakes at least within the shortest telemetry time-out.
+"""Number of times that the loop wakes at least within the shortest telemetry timeout.
 
-A value may expire early by this part of the time-out. The loop wakes a millisecond earlier than
+A value may expire early by this part of the timeout. The loop wakes a millisecond earlier than
 that, because a wait is rounded up to a millisecond.
 """
 _QUIET_PERIOD_NS = SECOND

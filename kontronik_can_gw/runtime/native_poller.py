@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.can.can_port import CanPort
 
 _HANDOVER_NS = 250 * MS
-"""C hands recorded calls over after the first turn at this age. Until then, a loss of power
+"""C hands recorded calls over after the first turn at this age. Until then, a power loss
 loses them."""
 
 
@@ -197,7 +197,7 @@ class NativePoller(Poller):
 
 
 def _write_departures(gate: Gate, departures: Any) -> None:
-    """Tell turns in C which frames are under way."""
+    """Tell iterations in C which frames are under way."""
     under_way = gate.under_way
     departures.count = under_way.count
     departures.still_since = gate.still_since
@@ -208,7 +208,7 @@ def _write_departures(gate: Gate, departures: Any) -> None:
 
 
 def _read_departures(departures: Any, gate: Gate, now: int) -> None:
-    """Tell the gate which frames are under way after turns in C."""
+    """Tell the gate which frames are under way after iterations in C."""
     gate.adopt(
         departures.count,
         departures.accepted,

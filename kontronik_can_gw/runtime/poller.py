@@ -58,7 +58,7 @@ class Poller:
     """
 
     is_native = False
-    """True for a ``NativePoller``, which makes turns of the loop in C."""
+    """True for a ``NativePoller``, which makes iterations of the loop in C."""
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock

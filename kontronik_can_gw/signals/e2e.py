@@ -9,16 +9,16 @@ from enum import Enum
 from functools import cache, cached_property
 
 DATA_IDS = 16
-"""Number of data ids of a profile with a list. The counter selects one of them."""
+"""Number of data IDs of a profile with a list. The counter selects one of them."""
 
 
 class DataIdMode(Enum):
-    """Bytes of the data id in the CRC."""
+    """Bytes of the data ID in the CRC."""
 
     BOTH = "both bytes before the frame, the low byte first"
     ALTERNATING = "one byte before the frame: the low byte with an even counter, else the high byte"
     NIBBLE = "the low byte and a 0 before the frame, which contains the other 4 bits"
-    LIST = "the counter's entry of a list of 16, after the frame"
+    LIST = "the counter's entry of a data ID list of 16, after the frame"
     LAST = "both bytes after the frame, the low byte first"
 
 
@@ -49,12 +49,12 @@ class Profile:
 
     @property
     def ids(self) -> int:
-        """Number of data ids that a message needs."""
+        """Number of data IDs that a message needs."""
         return DATA_IDS if self.mode is DataIdMode.LIST else 1
 
     @property
     def largest_id(self) -> int:
-        """The largest data id."""
+        """The largest data ID."""
         bits = {DataIdMode.LIST: 8, DataIdMode.NIBBLE: 12}.get(self.mode, 16)
         return (1 << bits) - 1
 
@@ -101,7 +101,7 @@ _ALL = (
     _P22,
 )
 PROFILES = {profile.name: profile for profile in _ALL}
-"""The supported profiles by name. The letter is the variant, which defines the data id's mode.
+"""The supported profiles by name. The letter is the variant, which defines the data ID's mode.
 
 Profiles 1 and 11 give equal frames. Profiles 2 and 22 give equal frames, but only profile 22 allows
 the CRC in any byte.
@@ -110,7 +110,7 @@ the CRC in any byte.
 
 @dataclass(frozen=True)
 class Protection:
-    """Profile and data ids of a message."""
+    """Profile and data IDs of a message."""
 
     profile: Profile
     data_ids: tuple[int, ...]
@@ -123,17 +123,17 @@ class Protection:
 
     @property
     def nibble(self) -> int:
-        """Bits 8 to 11 of the data id, which a frame contains with DataIdMode.NIBBLE."""
+        """Bits 8 to 11 of the data ID, which a frame contains with DataIdMode.NIBBLE."""
         return self.data_ids[0] >> 8 & 0xF
 
     @property
     def id_bytes(self) -> int:
-        """Number of bytes of the data id in the CRC."""
+        """Number of bytes of the data ID in the CRC."""
         return 1 if self.profile.mode in (DataIdMode.ALTERNATING, DataIdMode.LIST) else 2
 
     @property
     def is_id_last(self) -> bool:
-        """True if the data id follows the frame in the CRC, False if it precedes the frame."""
+        """True if the data ID follows the frame in the CRC, False if it precedes the frame."""
         return self.profile.mode in (DataIdMode.LIST, DataIdMode.LAST)
 
     @cached_property

@@ -18,9 +18,9 @@ from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 from kontronik_can_gw.status import GatewayStatus
 
 Pack = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], int]
-"""Maps ESCs, gateway, time, alive counter and page to the bits of a frame, without a CRC.
+"""Maps ESCs, gateway, time, alive counter and group to the bits of a frame, without a CRC.
 
-The page is given by its position in ``MessagePlan.pages``.
+The group is given by its position in ``MessagePlan.pages``.
 """
 MakeFrame = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], CanFrame]
 """Maps the same arguments to the frame, with its CRC."""
@@ -103,7 +103,7 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
 def _compile_page(
     plan: MessagePlan, page: int | None
 ) -> tuple[int, list[tuple[tuple[Piece, ...], _ReadRaw]]]:
-    """Return a page's constant bits, and pieces and function of each signal with a source."""
+    """Return a group's constant bits, and pieces and function of each signal with a source."""
     constant = 0
     sources = []
     for signal in plan.signals:
@@ -130,7 +130,7 @@ def _compile_raw(signal: SignalPlan) -> _ReadRaw:
 def _compile_whole(signal: SignalPlan) -> _ReadRaw:
     """Return the function of a signal with an integer raw value.
 
-    The value is multiplied first and rounded once to the nearest integer, halves up.
+    The value is multiplied first and rounded once to the nearest integer, half up.
     """
     source = signal.source
     assert source is not None

@@ -48,8 +48,8 @@ class Role(Enum):
     SOURCE = "source"
     ALIVE = "alive counter"
     CRC = "CRC"
-    DATA_ID = "E2E data id"
-    """Bits 8 to 11 of the data id, a constant."""
+    DATA_ID = "E2E data ID"
+    """Bits 8 to 11 of the data ID, a constant."""
     CONSTANT = "constant"
     MULTIPLEXER = "multiplexer"
 
@@ -223,7 +223,7 @@ class Layout:
 
     @property
     def data_ids(self) -> dict[int, tuple[int, ...]]:
-        """The data ids of protected messages, by id. The id has EXTENDED for 29 bits."""
+        """The data IDs of protected messages, by id. The id has EXTENDED for 29 bits."""
         found = {}
         for message in self.messages:
             if message.e2e is not None:

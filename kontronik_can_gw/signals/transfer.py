@@ -27,8 +27,8 @@ def transfer(
 ) -> list[CanFrame]:
     """Return the frames of a transfer.
 
-    ``seed`` is the start value of the CRC. ``queued`` is as in CanFrame. ``page`` is the page of
-    the first frame; each further frame has the next page.
+    ``seed`` is the start value of the CRC. ``queued`` is as in CanFrame. ``page`` is the group of
+    the first frame; each further frame has the next group.
     """
     if len(payload) > _BYTES_PER_FRAME:
         payload = crc_hqx(payload, seed).to_bytes(2, "little") + payload

@@ -1,4 +1,5 @@
-"""The longest delay of the gateway with real-time priority, beside programs that use all CPU time.
+"""The maximum latency of the gateway with real-time priority, beside programs that use all
+processors.
 
 The host of a virtual machine can stop a whole CPU. A process on each CPU with a higher priority
 than the gateway and the feeder measures these pauses: it sleeps for 1 ms again and again, and notes
@@ -42,7 +43,7 @@ Span = tuple[int, int]
 
 
 def delay_busy(context: Context) -> list[Figure]:
-    """Longest delay with 8 ESCs, recorder and CANopen under SCHED_FIFO, beside two busy loops."""
+    """Maximum latency with 8 ESCs, recorder and CANopen under SCHED_FIFO, beside two busy loops."""
     return _longest_delay(context, "busy CPUs", nullcontext())
 
 
@@ -74,8 +75,8 @@ def _longest_delay(
     longest_us = max(own, default=0) / 1000 if late else run.delay["max"]
     note = f"with the pauses of the host {run.delay['max']:.0f}, over {longer.seconds:g} s"
     return [
-        Figure(f"{name}, 99 %", run.delay["p99"], "us"),
-        Figure(f"{name}, longest delay", longest_us, "us", "<= 2000", note),
+        Figure(f"{name}, p99", run.delay["p99"], "us"),
+        Figure(f"{name}, maximum", longest_us, "us", "<= 2000", note),
         Figure(f"{name}, longest pause", max(map(_length, pauses), default=0) / 1000, "us"),
     ]
 

@@ -66,7 +66,7 @@ def ratio(above: list[Measured], below: list[Measured]) -> float:
 
 
 def cpu(context: Context) -> list[Figure]:
-    """CPU time for a live frame at 1, 8 and 64 ESCs: C, ours, the obvious program.
+    """CPU time for a live frame at 1, 8 and 64 ESCs: C, ours, the baseline program.
 
     Frames that are lost need no CPU time, so the losses are noted.
     """
@@ -127,7 +127,7 @@ def many(context: Context) -> list[Figure]:
     for escs, prefix in cases:
         run = once(context, "ours", escs, prefix=prefix)
         what = f"{escs} ESCs" + (" on one core" if prefix else "")
-        note = f"delay, 99 %: {run.delay['p99']} us, longest {run.delay['max']:.0f}"
+        note = f"latency, p99: {run.delay['p99']} us, maximum {run.delay['max']:.0f}"
         lost = run.result["lost"]
         figures.append(Figure(f"{what}: CAN frames lost", lost, f"of {run.frames}", "<= 0", note))
         figures.append(Figure(f"{what}: share of a core", run.cpu_share * 100, "%"))
@@ -135,21 +135,21 @@ def many(context: Context) -> list[Figure]:
 
 
 def delay(context: Context) -> list[Figure]:
-    """Delay from the last byte to the fifth CAN frame, one ESC: C, ours, the obvious program."""
+    """Latency from the last byte to the fifth CAN frame, one ESC: C, ours, the baseline program."""
     found = compare(context, 1)
     figures = []
     for program, runs in found.items():
-        note = f"99 %: {delay_of(runs, 'p99'):.0f}, longest {delay_of(runs, 'max'):.0f}"
+        note = f"p99: {delay_of(runs, 'p99'):.0f}, maximum {delay_of(runs, 'max'):.0f}"
         figures.append(Figure(f"{program}, median", delay_of(runs, "p50"), "us", note=note))
     pairs = zip(found["ours"], found["c"], strict=True)
     value = median([ours.delay["p50"] / c.delay["p50"] for ours, c in pairs])
     figures.append(Figure("ours / c, median", value, "x", "<= 1.1"))
-    figures.append(Figure("ours, 99 %", delay_of(found["ours"], "p99"), "us", "<= 2000"))
+    figures.append(Figure("ours, p99", delay_of(found["ours"], "p99"), "us", "<= 2000"))
     return figures
 
 
 def delay_full(context: Context) -> list[Figure]:
-    """The same delay with 8 ESCs, recorder, status file, CANopen nodes and a busy master.
+    """The same latency with 8 ESCs, recorder, status file, CANopen nodes and a busy master.
 
     The master asks 200 times a second for one of 20 objects.
     """
@@ -160,11 +160,11 @@ def delay_full(context: Context) -> list[Figure]:
         raise RuntimeError("the nodes answered no SDO request")
     lost = max(0, asked - answered - len(runs))  # the end of a run may cut off its last answer
     answer = median([run.result["sdo_us"]["p99"] for run in runs])
-    longest = f"longest {delay_of(runs, 'max'):.0f}"
+    longest = f"maximum {delay_of(runs, 'max'):.0f}"
     return [
         Figure("8 ESCs and all, median", delay_of(runs, "p50"), "us"),
-        Figure("8 ESCs and all, 99 %", delay_of(runs, "p99"), "us", "<= 1000", longest),
-        Figure("SDO answers, 99 %", answer, "us"),
+        Figure("8 ESCs and all, p99", delay_of(runs, "p99"), "us", "<= 1000", longest),
+        Figure("SDO responses, p99", answer, "us"),
         Figure("SDO requests not answered", lost, f"of {asked}", "<= 0"),
         Figure("CPU, all of it", cpu_of(runs), "us/frame", note=losses(runs)),
     ]

@@ -142,7 +142,7 @@ def main(arguments: list[str]) -> None:
     longest_ms = found[-1] * 1e3
     print(
         f"{len(escs)} nodes, type {int(kind)}, SYNC {sync_hz:g} Hz: {len(found)} requests, "
-        f"median {median_ms:.1f} ms, 99 % {p99_ms:.1f} ms, longest {longest_ms:.1f} ms "
+        f"median {median_ms:.1f} ms, p99 {p99_ms:.1f} ms, maximum {longest_ms:.1f} ms "
         f"({cores} CPUs)"
     )
 

@@ -275,7 +275,7 @@ class Bench(Talker):
         return self._answer(node)
 
     def _answer(self, node: int) -> bytes:
-        """Return the only SDO answer of a node."""
+        """Return the only SDO response of a node."""
         answers = []
         others = []
         for time, frame in self.heard:

@@ -20,7 +20,7 @@ SENT_FRAMES = GATEWAY << 16 | 0x0320
 
 
 def test_answers_of_a_node_are_never_overtaken() -> None:
-    """SDO answers, emergencies and heartbeats of one id are all sent in order."""
+    """SDO responses, emergencies and heartbeats of one id are all sent in order."""
     bench = Bench(changes=QUIET)
     for place in ("00 10 00", "18 10 01", "18 10 04"):
         bench.put(0x601, f"40 {place} 00 00 00 00")

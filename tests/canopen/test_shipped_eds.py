@@ -1,4 +1,4 @@
-"""The shipped EDS agrees with the sheet, the configuration's ranges and strict readers' rules."""
+"""The shipped EDS agrees with the protocol specification, the configuration and strict readers."""
 
 import re
 from collections import Counter

@@ -20,7 +20,7 @@ def synced(kind: int, *mapped: int) -> Bench:
 
 
 def read_at_once(bench: Bench, count: int) -> list[bytes]:
-    """Read ``count`` SYNCs in one turn of the loop. Return the PDOs that follow."""
+    """Read ``count`` SYNCs in one iteration of the loop. Return the PDOs that follow."""
     for _ in range(count):
         bench.gateway.receive_frame(CanFrame(0x80, b""), bench.now, bench.now)
     bench.gateway.advance(bench.now)

@@ -48,7 +48,7 @@ def test_the_details_are_the_keys_in_effect_and_the_tables(tmp_path: Path) -> No
     short = run("check", file).out.splitlines()
     assert found[: len(short)] == short
     assert "telemetry_timeout_ms = 250" in found
-    assert any(line.startswith("node-ID from an allocator") for line in found), found
+    assert any(line.startswith("node-ID from an allocation server") for line in found), found
     rows = [line for line in run("describe", "-c", file).out.splitlines() if "Battery" in line]
     assert len(rows) > 3
     assert set(rows[:3]) <= set(found)

@@ -15,7 +15,7 @@ SINGLE_ID: dict[str, Protect] = {
     "11A": partial(p11.e2e_p11_protect, data_id_mode=p11.E2E_P11_DATAID_BOTH),
     "11C": partial(p11.e2e_p11_protect, data_id_mode=p11.E2E_P11_DATAID_NIBBLE),
 }
-"""The function of autosar-e2e for each profile with one data id."""
+"""The function of autosar-e2e for each profile with one data ID."""
 IDS_OF_2 = tuple(random.Random(2).randbytes(16))
 DATA_IDS: dict[str, int | tuple[int, ...]] = {
     "1A": 0xABCD,

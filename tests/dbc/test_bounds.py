@@ -23,8 +23,8 @@ ATTRIBUTE = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\n'
 def nested(depth: int, width: int) -> str:
     """Return a message with a chain of multiplexers.
 
-    Each page of a multiplexer has all pages of the next one, so that there are ``width`` to the
-    power of ``depth`` pages.
+    Each group of a multiplexer has all groups of the next one, so that there are ``width`` to the
+    power of ``depth`` groups.
     """
     lines = ["BO_ 1 Msg: 8 A", ' SG_ s0 M : 0|1@1+ (1,0) [0|0] "" A']
     for n in range(1, depth):

@@ -39,7 +39,7 @@ from kontronik_can_gw.times import MS
 pytestmark = pytest.mark.promise("e2e")
 
 FIRST_16 = tuple(range(1, 17))
-"""The list of data ids in the examples of the specification."""
+"""The list of data IDs in the examples of the specification."""
 
 
 def protection(name: str, *data_ids: int) -> Protection:
@@ -218,7 +218,7 @@ def test_a_busy_bus_loses_frames_but_never_changes_their_order(
 
 
 def multiplexed() -> Layout:
-    """Return a layout with a message of three pages that profile 2 protects."""
+    """Return a layout with a message of three groups that profile 2 protects."""
     signals = [
         Sig("M_CRC", 0, 8),
         Sig("M_BZ", 8, 4),
@@ -297,13 +297,13 @@ def test_a_data_id_alone_means_profile_1_and_a_pattern_needs_no_data_id_for_it()
 @pytest.mark.parametrize(
     ("name", "data_ids", "text"),
     [
-        ("2", None, "needs 16 data ids, one for each counter; it has none"),
-        ("2", 5, "needs 16 data ids, one for each counter; it has 1"),
-        ("2", (256, *range(15)), "data id 0x100 is too large for E2E profile 2, at most 0xFF"),
-        ("5", None, "needs one data id; it has none"),
-        ("5", FIRST_16, "needs one data id; it has 16"),
-        ("11C", 0x1000, "data id 0x1000 is too large for E2E profile 11C, at most 0xFFF"),
-        ("1B", None, "needs one data id; it has none"),
+        ("2", None, "needs 16 data IDs, one for each counter; it has none"),
+        ("2", 5, "needs 16 data IDs, one for each counter; it has 1"),
+        ("2", (256, *range(15)), "data ID 0x100 is too large for E2E profile 2, at most 0xFF"),
+        ("5", None, "needs one data ID; it has none"),
+        ("5", FIRST_16, "needs one data ID; it has 16"),
+        ("11C", 0x1000, "data ID 0x1000 is too large for E2E profile 11C, at most 0xFFF"),
+        ("1B", None, "needs one data ID; it has none"),
     ],
 )
 def test_a_missing_or_unfit_data_id_is_refused(
@@ -511,9 +511,9 @@ def test_a_list_of_data_ids_is_read_in_its_usual_forms(text: str) -> None:
         ("P04", 5, "E2EProfile is 'P04', which is none of the profiles 1A, 1B"),
         ("P11", 5, "E2EProfile is 'P11', which is none of the profiles"),
         ("crc8_j1850", 5, "E2EProfile is 'crc8_j1850', which is none"),
-        ("P02", 5, "needs 16 data ids, one for each counter; it has 1"),
+        ("P02", 5, "needs 16 data IDs, one for each counter; it has 1"),
         ("P02", "1, 2, x", "E2EDataId is '1, 2, x', which is no list of numbers"),
-        ("P05", None, "needs one data id; it has none"),
+        ("P05", None, "needs one data ID; it has none"),
     ],
 )
 def test_an_unclear_attribute_is_refused(profile: str, data_id: object, text: str) -> None:

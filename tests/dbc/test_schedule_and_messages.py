@@ -139,10 +139,10 @@ NONE = 65535
 class Scene(NamedTuple):
     """Events of an ESC with one message, and the frames sent.
 
-    ``cycle`` and ``delay`` are the cycle and the minimum distance in ms. ``steps`` has the events,
-    each with its time in ms. With ``=`` before a time, the gateway is not called until then. The
-    numbers after ``live`` are the voltages of the frames in one read. ``sent`` has the times and
-    the voltages of the frames.
+    ``cycle`` and ``delay`` are the cycle and the minimum delay time in ms. ``steps`` has the
+    events, each with its time in ms. With ``=`` before a time, the gateway is not called until
+    then. The numbers after ``live`` are the voltages of the frames in one read. ``sent`` has the
+    times and the voltages of the frames.
     """
 
     title: str
@@ -168,7 +168,7 @@ SCENES = [
         [(10, 1), (20, 2), (30, 3)],
     ),
     Scene(
-        "events closer than the minimum distance are put off and send the newest value",
+        "events closer than the minimum delay time are put off and send the newest value",
         EVENT,
         "3 live 1, 6 live 2, 9 live 3, 10 live 7, 100",
         [(3, 1), (28, 7)],
@@ -232,7 +232,7 @@ SCENES = [
         delay=10,
     ),
     Scene(
-        "a cycle that the minimum distance puts off is not lost",
+        "a cycle that the minimum delay time puts off is not lost",
         CYCLIC_AND_ON_CHANGE,
         "90 live 1, 180, =190 live 2, 299",
         [(0, NONE), (90, 1), (120, 1), (190, 2), (220, 2)],
@@ -414,7 +414,7 @@ def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
     assert set(bench.raws(16, 16)) == {65535}
 
 
-# --- alive counter, pages
+# --- alive counter, groups
 
 
 def paged(
@@ -423,7 +423,7 @@ def paged(
     delay: int = 0,
     start: bool = False,
 ) -> Bench:
-    """Return the bench of a gateway with a message of three pages."""
+    """Return the bench of a gateway with a message of three groups."""
     signals = [
         Sig("Page", 0, 8, mux="M"),
         Sig("BatteryVoltage", 8, 16, mux="m1", factor="0.01"),
@@ -436,7 +436,7 @@ def paged(
 
 
 NOTHING = {1: 0xFFFF, 5: 0x80, 9: 0x80}
-"""Codes for "not available", by page."""
+"""Codes for "not available", by group."""
 
 
 @pytest.mark.promise("true")
@@ -445,7 +445,7 @@ NOTHING = {1: 0xFFFF, 5: 0x80, 9: 0x80}
 def test_after_a_loss_each_page_is_sent_as_not_available(kind: int, delay: int) -> None:
     bench = paged(kind, 0, delay, start=True)
     bench.until(SECOND)
-    # at the start each page is sent without an event
+    # at the start each group is sent without an event
     assert [frame.data[0] for _, frame in bench.sent] == list(NOTHING)
     for number in range(12):
         bench.until(bench.now + 10 * MS)

@@ -68,7 +68,7 @@ def exact(*numbers: Any) -> list[Decimal]:
     return [Decimal(str(number)) for number in numbers]
 
 
-# --- the rules, and the sheet
+# --- the rules, and the protocol specification
 
 
 def test_limits_leave_out_the_codes_and_contain_0() -> None:

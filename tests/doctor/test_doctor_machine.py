@@ -149,7 +149,7 @@ def test_parameters_on_a_file_system_without_journal_get_a_warning(
     assert [found.severity for found in findings.found] == ["warning"] * (kind != "ext4")
     for found in findings.found:
         assert found.text == (
-            f"stored parameters: {folder}: a loss of power may destroy them, "
+            f"stored parameters: {folder}: a power loss may destroy them, "
             f"because the file system is {kind}"
         )
         assert found.remedy == "Choose a folder on ext4 or f2fs as canopen.store:"

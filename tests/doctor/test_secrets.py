@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from kontronik_can_gw.canopen import eds
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.dbc.reader import parse_database
-from kontronik_can_gw.desk.parcel.files import clean_dbc, clean_eds, clean_toml
-from kontronik_can_gw.desk.parcel.secrets import REMOVED, Cleaner, is_secret_name
+from kontronik_can_gw.desk.bundle.files import clean_dbc, clean_eds, clean_toml
+from kontronik_can_gw.desk.bundle.secrets import REMOVED, Cleaner, is_secret_name
 
 pytestmark = pytest.mark.promise("support-bundle")
 

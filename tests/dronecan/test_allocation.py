@@ -1,6 +1,6 @@
-"""Node-IDs from allocators that die or lie, and other nodes that request an id as well.
+"""Node-IDs from allocation servers that die or lie, and other nodes that request an id as well.
 
-The allocator of the package ``dronecan`` is tested in tests/vcan.
+The allocation server of the package ``dronecan`` is tested in tests/vcan.
 """
 
 import random
@@ -28,7 +28,7 @@ def receive_allocation(
     source: int = 100,
     first: int = 0,
 ) -> None:
-    """Receive a message of an allocator, or of another requesting node if ``source`` is 0."""
+    """Receive a message of an allocation server, or of another client if ``source`` is 0."""
     message = Allocation(node_id=node_id, first_part_of_unique_id=bool(first))
     message.unique_id.from_bytes(unique_id)
     more = {} if source else {"discriminator": first}
@@ -65,7 +65,7 @@ def test_the_parts_of_an_id_are_sent_in_turn_and_repeated_without_answer() -> No
     bench = waiting().run(1.1)
     (own,) = unique_ids(bench)
     receive_allocation(bench, 0, own[:6])
-    bench.run(5)  # the allocator does not answer
+    bench.run(5)  # the allocation server does not answer
     firsts = [each.payload.first_part_of_unique_id for each in bench.of("Allocation")]
     assert firsts[:3] == [True, False, True]
     assert all(firsts[2:])
@@ -128,7 +128,7 @@ def test_an_allocator_that_lies_sets_no_node_id_and_does_no_harm() -> None:
 
 @pytest.mark.parametrize("source", [0, 100])
 def test_requests_of_other_nodes_delay_ours(source: int) -> None:
-    """A request of another client and the allocator's answer to it delay our request."""
+    """A request of another client and the allocation server's answer to it delay our request."""
     bench = waiting()
     for turn in range(20):
         receive_allocation(

@@ -131,7 +131,7 @@ def test_no_stale_value_is_taken_for_fresh_and_arming_is_never_blocked(
         assert not pilot.refuses_to_arm(now)
         for esc in range(4):
             got = pilot.known(esc, now, 20 * MS)
-            if got is not None:  # it has just arrived, so the ESC sent it within its time-out
+            if got is not None:  # it has just arrived, so the ESC sent it within its timeout
                 known = world.sent(esc, now - 20 * MS - TIMEOUT)
                 assert got.rpm in [speed // ratio for _, speed, _ in known]
                 assert any(got.voltage == pytest.approx(volts, abs=0.016) for *_, volts in known)

@@ -131,7 +131,11 @@ def test_a_mistake_is_refused_in_one_line(table: dict[str, Any], reason: str) ->
     ("can_id", "more", "user"),
     [
         (0x2B, "node_id = 42\nper_esc_nodes = true", "DroneCAN node 43"),
-        (0x10345210, "node_id = 0", "DroneCAN, because an allocator may assign any node-ID"),
+        (
+            0x10345210,
+            "node_id = 0",
+            "DroneCAN, because an allocation server may assign any node-ID",
+        ),
         (0x1034522B, "node_id = 42", ""),
         (0x2B - (1 << 31), "node_id = 42\nper_esc_nodes = true", ""),  # 11 bits: another frame
     ],
@@ -170,7 +174,7 @@ def test_its_modules_are_only_loaded_if_it_is_on_and_openssl_never(is_on: bool) 
 
 @pytest.mark.parametrize("canopen", [False, True])
 def test_other_outputs_send_the_same_frames_with_and_without_it(canopen: bool) -> None:
-    """Every 11-bit frame has the same bytes and time. SDO answers are included."""
+    """Every 11-bit frame has the same bytes and time. SDO responses are included."""
     found = []
     for enabled in (True, False):
         given = loaded(
@@ -201,7 +205,7 @@ def test_other_outputs_send_the_same_frames_with_and_without_it(canopen: bool) -
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("node_id", [42, 0])
 def test_a_replay_is_identical_to_the_run(seed: int, node_id: int) -> None:
-    """The bus has random frames, and an allocator may set the node-IDs.
+    """The bus has random frames, and an allocation server may set the node-IDs.
 
     The replay uses the bytes of the capture and its seed.
     """
@@ -227,7 +231,7 @@ def test_a_capture_header_gives_the_same_nodes_on_any_machine() -> None:
 
 
 def test_measurements_do_not_need_python() -> None:
-    """Turns in C continue: the core sends the measurements, and Python sends once a second."""
+    """Iterations in C continue: the core sends the measurements, and Python sends once a second."""
     bench = Bench(2, extended_hz=20)
     if bench.gateway.core.language != "C":
         pytest.skip(bench.gateway.core_note)

@@ -20,7 +20,7 @@ def test_node_info_identifies_the_node_and_a_restart_is_refused() -> None:
     names = [bytes(info.name.to_bytes()) for info in infos]
     assert names == [b"com.example.gw.e0", b"com.example.gw.e1"]
     ids = [bytes(info.hardware_version.unique_id.to_bytes()) for info in infos]
-    assert len({each[:6] for each in ids}) == 2  # allocators get these six bytes first
+    assert len({each[:6] for each in ids}) == 2  # allocation servers get these six bytes first
     assert infos[0].status.uptime_sec == 2
     assert infos[0].hardware_version.major == 1
     magic = protocol.RestartNode.Request().MAGIC_NUMBER

@@ -24,7 +24,7 @@ WARM_NOW = LIVE._replace(operating_errors=1 << WARM)
 def test_all_escs_are_sent_at_one_rate_while_telemetry_is_fresh(
     per_esc_nodes: bool,
 ) -> None:
-    """The last value is sent within the ESC's time-out. The other ESC is still sent after that."""
+    """The last value is sent within the ESC's timeout. The other ESC is still sent after that."""
     bench = Bench(2, per_esc_nodes=per_esc_nodes).run(1)
     assert bench.intervals("Status") == {0, 20 * MS}
     order = [(each.source, each.payload.esc_index) for each in bench.of("Status")]

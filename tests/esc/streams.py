@@ -15,7 +15,7 @@ FRAGMENTS = [*b"K KO KOD KODL KODI KODK KODX KOKO KKOD KODKODI \0 \xff".split(b"
 
 
 def form_of(row: FormRow) -> Form:
-    """Return the package's form for a row of the sheet."""
+    """Return the package's form for a row of the protocol specification."""
     return next(form for form in FORMS if form.name == f"{row.kind}_{row.layout}")
 
 

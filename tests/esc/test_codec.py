@@ -52,7 +52,7 @@ RECORDED: dict[bytes, LiveData | InfoData] = {
         max_bec_temperature=33,
     ),
 }
-"""The recorded values in steps of the sheet."""
+"""The recorded values in steps of the protocol specification."""
 form_rows = pytest.mark.parametrize("row", FORM_ROWS, ids=lambda row: f"{row.kind} {row.layout}")
 
 

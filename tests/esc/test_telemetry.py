@@ -326,8 +326,8 @@ def chunks_of(seed: int) -> list[tuple[bytes, int]]:
 def fresh_frames(timed: list[tuple[bytes, int]], now: int) -> list[Data]:
     """Return the live frames that may be shown at ``now``, by brute force.
 
-    All bytes of such a frame were read within the time-out before its last byte, and that byte was
-    read within the time-out before ``now``.
+    All bytes of such a frame were read within the timeout before its last byte, and that byte was
+    read within the timeout before ``now``.
     """
     whole = b"".join(piece for piece, _ in timed)
     read_at = [when for piece, when in timed for _ in piece]

@@ -1,6 +1,6 @@
 """Judges every frame on a bus.
 
-A value is right if it is marked as not available, or if an ESC sent it within the time-out. Any
+A value is right if it is marked as not available, or if an ESC sent it within the timeout. Any
 other value is wrong.
 
 ``Judge`` is pure: it gets frames and times. ``BusWatch`` reads a socket in a thread. Its times are
@@ -75,7 +75,7 @@ class Received(NamedTuple):
 class Judge:
     """Compares received frames with the frames that the ESCs sent.
 
-    ``slack_ns`` is the time that the machine may take in addition to the time-out.
+    ``slack_ns`` is the time that the machine may take in addition to the timeout.
     """
 
     def __init__(
@@ -308,7 +308,7 @@ class BusWatch(Judge):
     def _run(self) -> None:
         try:
             while not self._closed:
-                # An OSError is a time-out or a lost interface. The socket remains usable.
+                # An OSError is a timeout or a lost interface. The socket remains usable.
                 with contextlib.suppress(OSError):
                     data, _, flags, address = self._socket.recvmsg(16)
                     self._received(data, flags, address[0])

@@ -2,8 +2,8 @@
 
 Every field of frame n is computed from n and the ESC by a fixed mixing function. A value on the bus
 therefore shows which frames may have carried it. Values that are wrong, old or combined from two
-frames are recognised. All values are inside the sheet's ranges and differ from the DBC's codes for
-"not available" and "error".
+frames are recognised. All values are inside the protocol specification's ranges and differ from the
+DBC's codes for "not available" and "error".
 
 The feeder's thread writes the records. Other threads may read them, and may set ``on``, ``write``,
 ``mangle`` and ``rate_hz``.

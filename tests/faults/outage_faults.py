@@ -33,7 +33,7 @@ RATE_HZ = 10
 SHORTEST_S = 1
 LONGEST_S = 600
 IN_KERNEL = 6
-"""Frames of the gateway in front of the driver: the capacity of the smallest send buffer."""
+"""Frames of the gateway in the socket queue: the capacity of the smallest send buffer."""
 IN_DRIVER = 1
 """Frames that the slcan driver has written to the adapter, which has not read them."""
 HELD = IN_KERNEL + IN_DRIVER

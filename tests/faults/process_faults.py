@@ -26,7 +26,7 @@ RESTART_LIMIT_S = 3.0
 """Longest recovery in s, including the start of Python."""
 STOPPING = 2
 TIMEOUT_OBJECT = 0x2100, 4
-"""Index and subindex of the telemetry time-out in ms, which a master may set and store."""
+"""Index and subindex of the telemetry timeout in ms, which a master may set and store."""
 process = partial(fault, "Process", limit_s=RESTART_LIMIT_S)
 
 
@@ -48,7 +48,7 @@ def killed(bench: Bench, injection: Injection, n: int) -> None:
         value = 200 + generator.randrange(90)
         known = {250, value}
         set_to = master.write(1, *TIMEOUT_OBJECT, value, 2)
-        bench.expect(set_to == 0, "the master cannot set the time-out")
+        bench.expect(set_to == 0, "the master cannot set the timeout")
         if n % 2:
             bench.expect(master.store(1) == 0, "the master cannot store")
             known = {value}
@@ -59,7 +59,7 @@ def killed(bench: Bench, injection: Injection, n: int) -> None:
         time.sleep(generator.random() * 0.3)
         start_and_wait(injection)
         found = master.read(1, *TIMEOUT_OBJECT)
-        bench.expect(found in known, f"the stored time-out is {found}, not one of {known}")
+        bench.expect(found in known, f"the stored timeout is {found}, not one of {known}")
         master.write(1, *TIMEOUT_OBJECT, 250, 2)
         master.store(1)
 

@@ -180,7 +180,7 @@ def test_another_device_with_ids_of_a_further_output_is_noticed() -> None:
     [
         (0x182, "Volts: id 182h is used by TPDO 1 of CANopen node 2"),
         (0x80, "SYNC"),
-        (0x581, "SDO answers of CANopen node 1"),
+        (0x581, "SDO responses of CANopen node 1"),
     ],
 )
 def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused(

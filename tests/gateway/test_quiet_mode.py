@@ -161,7 +161,7 @@ def test_a_lost_port_leads_to_quiet_mode_as_silence_does() -> None:
 
 
 def test_quiet_mode_waits_until_all_values_have_expired() -> None:
-    """A master can set a telemetry time-out that is longer than can.quiet_after_s."""
+    """A master can set a telemetry timeout that is longer than can.quiet_after_s."""
     given = loaded(quiet_after_s=1)
     bench = Bench(given)
     for esc, settings in enumerate(given.escs):
@@ -177,7 +177,7 @@ def test_quiet_mode_waits_until_all_values_have_expired() -> None:
 def test_quiet_mode_sends_nothing_and_has_no_deadline() -> None:
     bench = Bench(loaded(canopen=True, dronecan=True))
     bench.until_quiet()
-    bench.run(20)  # info data and emergencies have their own time-outs
+    bench.run(20)  # info data and emergencies have their own timeouts
     bench.wakes = 0
     assert bench.run(24 * 3600) == []
     assert bench.wakes == 0

@@ -233,7 +233,8 @@ def _dbc_of(configuration: str) -> Database:
 def flags() -> dict[str, tuple[str, int]]:
     """Return the word and the bit of each shipped flag.
 
-    The flags are in the order of their bits. The name of each has a word of its row in the sheet.
+    The flags are in the order of their bits. The name of each has a word of its row in the protocol
+    specification.
     """
     found: dict[str, tuple[str, int]] = {}
     for message, word, bits in (

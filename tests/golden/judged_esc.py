@@ -1,7 +1,7 @@
 """The data of an ESC as found in its bytes by brute force, and the correct values of signals.
 
-The judge of the golden set and the recorded hour use it. It uses the sheet and the oracle of
-values, but nothing of the product.
+The judge of the golden set and the recorded hour use it. It uses the protocol specification and the
+oracle of values, but nothing of the product.
 """
 
 import re
@@ -189,7 +189,7 @@ def expected(
     state: State,
     now: int,
 ) -> Fraction | int | None:
-    """Return the correct value of a signal, in the unit of the sheet.
+    """Return the correct value of a signal, in the unit of the protocol specification.
 
     Returns None if the value is not available. KeyError if the value is not judged.
     """

@@ -74,7 +74,7 @@ def uart_bytes(words: list[str]) -> bytes:
         fields = specification.INFO_FIELDS
         structure = specification.INFO_STRUCT
     names = [field.name for field in fields]
-    assert set(given) <= set(names), f"no field of the sheet: {given}"
+    assert set(given) <= set(names), f"no field of the protocol specification: {given}"
     values = [given.get(name, 0) for name in names]
     body = struct.pack(structure, *values)
     row = reference.form_row(kind, layout or "v4")

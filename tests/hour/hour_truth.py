@@ -2,7 +2,8 @@
 
 The capture has any length. It contains dropouts, an unplugged port, swapped devices (one without a
 BEC current), errors for a while, problems of the bus, and a change of the wall clock. The judge of
-the golden set (tests/golden/judge.py) computes the correct values from the frames and the sheet.
+the golden set (tests/golden/judge.py) computes the correct values from the frames and the protocol
+specification.
 """
 
 import random

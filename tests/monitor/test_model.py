@@ -138,7 +138,7 @@ def test_old_values_are_not_shown_after_the_last_frame() -> None:
 
 
 def test_the_history_has_a_value_for_each_second_with_data() -> None:
-    """The line is silent after 3.5 s, and the values end with the time-out of telemetry."""
+    """The line is silent after 3.5 s, and the values end with the timeout of telemetry."""
     monitor = watched(ONE, flight(ONE, 6, until=3.5), 7.05)
     history = list(monitor.escs[0].tracks["battery_voltage"].history)
     assert len(history) == 7

@@ -224,7 +224,7 @@ def test_only_notable_changes_are_published_at_once() -> None:
     assert [kind for _, kind in kinds] == ["idle", "run", None]
     assert abs(kinds[1][0] - 6 * SECOND_NS) <= 0.25 * SECOND_NS  # after a second of power-up
     lost = next(now for now, found in states(published) if found["link_state"] == "Lost")
-    assert lost - 9 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway's own time-out is included
+    assert lost - 9 * SECOND_NS <= 1.3 * SECOND_NS  # the gateway's own timeout is included
     assert len(states(published)) <= 10
     available = payloads(published, TOPICS.of("esc1", "available"))
     assert [payload for _, payload in available] == [b"online", b"offline"]

@@ -1,4 +1,4 @@
-"""A loop that turns in C, with a simulated kernel.
+"""A loop that runs in C, with a simulated kernel.
 
 A replay of its recording by the Python core gives the frames that it sent.
 """
@@ -62,7 +62,7 @@ pytestmark = [
 
 
 class InC:
-    """A loop that turns in C, in a World. ``turns`` has the times of turns in Python."""
+    """A loop that runs in C, in a World. ``turns`` has the times of turns in Python."""
 
     def __init__(
         self,
@@ -203,7 +203,7 @@ def test_sent_frames_equal_those_of_a_replay_in_python(
 def test_recorded_calls_reach_the_recorder_within_a_third_of_a_second(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """After a loss of power the calls that C still holds are lost. Before 0.25 s it keeps them."""
+    """After a power loss the calls that C still holds are lost. Before 0.25 s it keeps them."""
     it = Recorded(1, monkeypatch)
     delays = []
 
@@ -246,9 +246,9 @@ def test_changed_error_bits_interrupt_turns_in_c_only_if_needed(
     has_nodes: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The loop turns in Python only for housekeeping and heartbeats.
+    """The iterations of the loop in Python only for housekeeping and heartbeats.
 
-    An emergency is sent before the core's frames of the same turn.
+    An emergency is sent before the core's frames of the same iteration.
     """
     it = InC(monkeypatch, outputs=[_nodes(ESCS)] if has_nodes else [])
     poller: Any = it.loop._poller
@@ -349,7 +349,7 @@ def test_a_failed_interface_is_noticed_at_the_next_frame(
     answer: Sent,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Neither error is a full bus, for which turns in C would wait."""
+    """Neither error is a full bus, for which iterations in C would wait."""
     it = InC(monkeypatch)
     it.feed(LiveData(consumed_charge=n) for n in range(300))
     it.run(1)
@@ -386,7 +386,7 @@ def test_sending_to_a_busy_driver_is_retried_every_two_milliseconds(
 def test_a_slow_bus_gets_the_newest_pages_of_a_multiplexed_message(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A waiting page is replaced only by a newer version of the same page, and pages keep order."""
+    """A waiting group is replaced only by its newer version, and groups keep their order."""
     signals = [Sig("Page", 0, 8, mux="M")]
     source = "electrical_speed"
     for page in range(8):
@@ -399,7 +399,7 @@ def test_a_slow_bus_gets_the_newest_pages_of_a_multiplexed_message(
     it.bus.frame_ns = 15 * MS
     made: list[int] = []
     for at in range(it.begun, it.begun + 4 * SECOND, 10 * MS):
-        # Each frame causes one page, at first faster than the bus takes them. Then it catches up.
+        # Each frame causes one group, at first faster than the bus takes them. Then it catches up.
         if (at - it.begun) % SECOND < 400 * MS:
             made.append(at)
             wire = encode(LiveData(electrical_speed=len(made)), WireLayout.V4)
@@ -417,10 +417,10 @@ def test_a_slow_bus_gets_the_newest_pages_of_a_multiplexed_message(
             order.append(speed)
             period, place = divmod(at - it.begun, SECOND)
             if place < 400 * MS:
-                assert at - made[speed - 1] <= 90 * MS, "the eight pages come round in 80 ms"
+                assert at - made[speed - 1] <= 90 * MS, "the eight groups come round in 80 ms"
             else:
                 after[period] += 1
-    assert max(after.values()) <= 8, "one of each page was left"
+    assert max(after.values()) <= 8, "one of each group was left"
     assert sorted(pages) == list(range(8))
     for speeds in pages.values():
         assert speeds == sorted(set(speeds))

@@ -1,7 +1,7 @@
-"""Reads a log of the kernel's target dm-log-writes, and makes the states after a loss of power.
+"""Reads a log of the kernel's target dm-log-writes, and makes the states after a power loss.
 
 The kernel logs completed writes when the next flush begins, and writes with FUA (forced unit
-access) when they are durable. After a loss of power at position ``p`` of the log, a device that
+access) when they are durable. After a power loss at position ``p`` of the log, a device that
 keeps its promises has
 
 1. all writes before the last flush that precedes ``p``,
@@ -95,7 +95,7 @@ def entries_before(log: memoryview, at: int, mark: Entry) -> tuple[list[Entry], 
 
 
 class State(NamedTuple):
-    """The content of the device after a loss of power behind entry ``at``.
+    """The content of the device after a power loss behind entry ``at``.
 
     The device has all writes before entry ``base``, and then these ``writes``.
     """

@@ -3,7 +3,7 @@
     python tests/plug/cuts.py ext4|f2fs|vfat --states N --seed N --folder DIR
 
 ``power_cuts.py`` runs it in User Mode Linux. The gateway runs on a logged device. Each state
-that a loss of power may leave is mounted and judged, and the recorder starts in it. Every tenth
+that a power loss may leave is mounted and judged, and the recorder starts in it. Every tenth
 state loses power a second time while it is mounted and used again. In every 100th state `run`
 itself starts. The exit code is 1 if a state is bad. DIR gets
 
@@ -70,7 +70,7 @@ class Examiner:
         self.rescued = 0
         """Number of states that the kernel mounted only after a repair."""
         self.undone = 0
-        """Number of second losses of power that undid flushed writes of captures."""
+        """Number of second power losses that undid flushed writes of captures."""
 
     def examine(
         self,
@@ -192,7 +192,7 @@ class Tally:
 
 
 def second_cuts(state: State, log: Log, generator: random.Random) -> Iterator[tuple[Write, ...]]:
-    """Yield the writes of states after a second loss of power. ``log`` is from the first to it."""
+    """Yield the writes of states after a second power loss. ``log`` is from the first to it."""
     for _ in range(SECOND_CUTS):
         at = generator.choice(log.positions())
         second = log.variant(at, generator) if generator.random() < 0.5 else log.prefix(at)
@@ -207,7 +207,7 @@ def examine_all(
     generator: random.Random,
     folder: Path,
 ) -> Tally:
-    """Examine the states in the order of the log, and second losses of power in some of them."""
+    """Examine the states in the order of the log, and second power losses in some of them."""
     tally = Tally(examiner, folder)
     flushed: Verdict | None = None
     base = 0

@@ -1,4 +1,4 @@
-"""Judges the files of a gateway after a loss of power."""
+"""Judges the files of a gateway after a power loss."""
 
 import json
 from collections.abc import Container, Mapping
@@ -16,7 +16,7 @@ from kontronik_can_gw.runtime.status.snapshot import PROGRAM
 from kontronik_can_gw.times import SECOND
 
 MAX_LOSS_NS = SECOND
-"""Input that a loss of power may cost."""
+"""Input that a power loss may cost."""
 NODE = "esc1"
 TIMEOUT = 0x210004
 HEARTBEAT = 0x101700
@@ -42,7 +42,7 @@ class Verdict:
     blocks: dict[str, int] = field(default_factory=dict)
     """Number of intact blocks from the beginning of each capture."""
     loss_ns: int = 0
-    """Longest time of input before the loss of power that is missing."""
+    """Longest time of input before the power loss that is missing."""
     found: int = 0
     """Number of the stored set. 0 without stored parameters."""
 

@@ -45,11 +45,11 @@ class FileSystem(NamedTuple):
     repair: tuple[str, ...] = ()
     """Command that a system runs before it mounts the file system. Exit code 1: repaired."""
     rescue: tuple[str, ...] = ()
-    """The same, if the kernel refuses to mount it after a torn write or a second loss of power."""
+    """The same, if the kernel refuses to mount it after a torn write or a second power loss."""
     unit: int = SECTOR
     """A write reaches the device in units of this number of bytes."""
     is_recovery_safe: bool = True
-    """False if a loss of power while it is mounted again may undo flushed writes.
+    """False if a power loss while it is mounted again may undo flushed writes.
 
     f2fs in Linux 6.1 overwrites the nodes that fsync has written before it has a new checkpoint.
     """
@@ -157,7 +157,7 @@ def _store_often(
 ) -> None:
     for number in range(first + 1, first + STORES + 1):
         value = LOWEST + number
-        bench.expect(master.write(1, 0x2100, 4, value, 2) == 0, "the time-out cannot be set")
+        bench.expect(master.write(1, 0x2100, 4, value, 2) == 0, "the timeout cannot be set")
         bench.expect(master.write(1, 0x1017, 0, value, 2) == 0, "the heartbeat cannot be set")
         device.mark(f"storing={number}")
         bench.expect(master.store(1) == 0, "the master cannot store")

@@ -1,4 +1,4 @@
-"""The states after a loss of power that follow from a log of writes and flushes."""
+"""The states after a power loss that follow from a log of writes and flushes."""
 
 import random
 import struct

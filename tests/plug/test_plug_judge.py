@@ -1,4 +1,4 @@
-"""The judge of files after a loss of power, with files made by hand."""
+"""The judge of files after a power loss, with files made by hand."""
 
 import json
 from collections.abc import Callable

@@ -321,7 +321,7 @@ static uint32_t take(void)
     return all;
 }
 
-/* Takes each page of each message once. */
+/* Takes each group of each message once. */
 static void take_all(void)
 {
     for (int round = 0; round < ROUNDS; round++) {

@@ -162,7 +162,7 @@ def limits_of(plan: Plan) -> dict[str, int]:
         "for (int i = 0; i < g->plan->escs; i++)": plan.escs,
         "for (int i = 0; i < g->plan->escs; i++) {": plan.escs,
         "for (uint32_t k = 0; k < m->escs; k++)": plan.escs,
-        "mark(g, i, when, CYCLE);": 2 * plan.messages,  # a cycle and a minimum distance of each
+        "mark(g, i, when, CYCLE);": 2 * plan.messages,  # a cycle and a minimum delay time of each
         "gap = 2 * gap + 1;": depth,
         "for (uint32_t k = gap; k < size; k++) {": plan.messages,
         "for (; k < g->pendings && g->taken < max; k++) {": plan.messages,

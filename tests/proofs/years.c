@@ -627,7 +627,7 @@ static int make_temperature(const years *y, uint8_t *to)
     return (int)(put(p, 0, 1) - to);
 }
 
-/* Checks a frame of a transfer. Numbers of transfers have 5 bits and count each type alone. */
+/* Checks a frame of a transfer. Transfer IDs have 5 bits and count each type alone. */
 static void check_part(years *y, int rule, int64_t now, const uint8_t *data, int size)
 {
     static const uint8_t signature[] = {0x54, 0xB2, 0xFB, 0xA2, 0xAE, 0x28, 0xAF, 0xA9};

@@ -172,13 +172,10 @@ def measure_file(path: Path) -> tuple[Measure, list[Hit]]:
 def measure_text(source: str, suffix: str) -> tuple[Measure, list[Hit]]:
     """Count a text whose kind follows from its suffix: .py, .c, .h or .md."""
     measure = Measure()
-    if suffix == ".py":
-        prose = _count_python(source, measure)
-    elif suffix == ".md":
-        prose = _markdown_prose(source)
+    prose = prose_of(source, suffix, measure)
+    if suffix == ".md":
         measure.long_lines = _long_markdown_lines(source)
-    else:
-        prose = _c_prose(source)
+    elif suffix != ".py":
         lines = source.split("\n")
         numbers = {number for number, _ in prose}
         measure.long_lines = sum(len(lines[number - 1]) > MAX_COLUMNS for number in numbers)
@@ -190,6 +187,13 @@ def measure_text(source: str, suffix: str) -> tuple[Measure, list[Hit]]:
                 measure.patterns[name] += 1
                 hits.append(Hit(number, name, line.strip()))
     return measure, hits
+
+
+def prose_of(source: str, suffix: str, measure: Measure) -> list[tuple[int, str]]:
+    """Return the lines of prose of a text, each with its number. Counts the code of Python."""
+    if suffix == ".py":
+        return _count_python(source, measure)
+    return _markdown_prose(source) if suffix == ".md" else _c_prose(source)
 
 
 def _count_python(source: str, measure: Measure) -> list[tuple[int, str]]:

@@ -1,4 +1,4 @@
-"""The World for a loop that turns in C: it answers the system calls of linux.c.
+"""The World for a loop that runs in C: it answers the system calls of linux.c.
 
 tests/native/fake_kernel.c passes the calls on to the World.
 """

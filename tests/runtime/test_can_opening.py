@@ -97,7 +97,7 @@ def uart() -> Iterator[tuple[int, str]]:
 
 
 class Running:
-    """A loop with one port. The test runs each turn."""
+    """A loop with one port. The test runs each iteration."""
 
     def __init__(
         self,

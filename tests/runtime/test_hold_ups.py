@@ -1,4 +1,4 @@
-"""A process that was held up sends no value older than its time-out, and loses no fresh one.
+"""A process that was held up sends no value older than its timeout, and loses no fresh one.
 
 On the CAN side it obeys commands that waited, sends the answers, and computes measurements again.
 """
@@ -132,7 +132,7 @@ def test_after_any_hold_up_values_end_in_time_and_ages_are_true(
         assert (age + 1) * MS >= truth - period - 2 * MS
     for when, looked in lost:
         # The frame arrived between two checks of the port. The loss may be found earlier than
-        # the time-out by the time between these two checks.
+        # the timeout by the time between these two checks.
         newest = max(whole for whole in wire.frames if whole <= looked)
         look = bisect_left(world.looks, newest)
         between = world.looks[look] - world.looks[look - 1]
@@ -145,7 +145,7 @@ def test_the_loop_checks_its_ports_four_times_per_shortest_time_out(
     monkeypatch: pytest.MonkeyPatch,
     sends: bool,
 ) -> None:
-    """A master may change the time-out. No message wakes the loop, and it does not check more."""
+    """A master may change the timeout. No message wakes the loop, and it does not check more."""
     world = World(2)
     escs = (EscSettings("esc1", timeout_ns=SECOND), EscSettings("esc2"))
     loop = loop_in(world, monkeypatch, escs, Layout("", "", ()))
@@ -322,7 +322,7 @@ def test_a_hold_up_is_logged_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Delays that are shorter than the shortest time-out are not logged."""
+    """Delays that are shorter than the shortest timeout are not logged."""
     world = World()
     start = world.now
     loop = begin(monkeypatch, world, EscSettings("esc1", timeout_ns=100 * MS))
@@ -493,7 +493,7 @@ def test_a_slow_bus_gets_the_newest_values_in_order(
 ) -> None:
     """The frames of four ESCs arrive together, and the kernel takes six frames in advance.
 
-    The C core sends them in the background: hardly a turn of the loop is needed for it.
+    The C core sends them in the background: hardly an iteration of the loop is needed for it.
     """
     world = World(4)
     start = world.now
@@ -561,7 +561,7 @@ TPDO = 0x181
 SPEED = 0x688
 ZEROS = "00 00 00 00"
 WATCH = ("23 16 10 01 2c 01 05 00", "2f 29 10 01 01 00 00 00", "2b 00 21 04 60 ea 00 00")
-"""SDO requests: watch node 5 for 300 ms, keep the state at its loss, time-out of the ESC 60 s."""
+"""SDO requests: watch node 5 for 300 ms, keep the state at its loss, timeout of the ESC 60 s."""
 
 
 class Bench:
@@ -805,7 +805,7 @@ def test_emergencies_of_a_hold_up_are_sent_in_order_of_time(
 
 
 def test_an_error_of_the_esc_in_a_hold_up_precedes_the_loss(bench: Bench) -> None:
-    """The frames that waited are younger than the time-out. The frame before them is older."""
+    """The frames that waited are younger than the timeout. The frame before them is older."""
     start = bench.world.now
     wire = bench.wire
     for at in range(10, 300, 10):
@@ -836,7 +836,7 @@ def test_the_loss_is_reported_before_the_node_stops_because_of_it(bench: Bench) 
 def test_a_loss_that_a_hold_up_hides_is_logged_between_the_two_good_states(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Loss and return are found in one turn, so the link has the same state before and after it."""
+    """Loss and return are found in one iteration, so the link's state is the same after it."""
     world = World()
     start = world.now
     world.wires[0].stream(start, start + 3 * SECOND, 10 * MS)

@@ -1,4 +1,4 @@
-"""The parameter files: order, results, damage, failing disks, and loss of power at any time."""
+"""The parameter files: order, results, damage, failing disks, and power loss at any time."""
 
 import errno
 import itertools
@@ -172,7 +172,7 @@ def test_an_unreadable_file_is_kept_and_half_a_new_file_is_never_read(
     assert [path.name for path in folder.iterdir()] == ["esc1.params"]
 
 
-# --- loss of power
+# --- power loss
 
 
 Step = tuple[str, ...]
@@ -260,7 +260,7 @@ class Recorder:
 
 
 def after_power_loss(files: dict[str, str], steps: list[Step]) -> list[dict[str, str]]:
-    """Return every state that the disk may have after a loss of power.
+    """Return every state that the disk may have after a power loss.
 
     ``files`` has the contents of the disk before the steps. Changes without fsync may be on disk
     or not:
@@ -345,7 +345,7 @@ DAMAGED = f"{FILE}.damaged"
 
 
 def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
-    """Return the wrong contents that may be found after a loss of power.
+    """Return the wrong contents that may be found after a power loss.
 
     The content confirmed last is right, and so is the one being saved.
     """

@@ -111,7 +111,16 @@ def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
     seen = judged(bench.document(ports=ports))
     assert seen.code == TROUBLE
     assert seen.sentence == "running, 1 fault"
-    assert seen.troubles[0].startswith("esc2: no bytes: ESC off")
+    assert seen.faults[0].startswith("esc2: no bytes: ESC off")
+
+
+def test_the_old_name_of_faults_has_the_same_texts() -> None:
+    bench = heard()
+    bench.silent.add(1)
+    bench.run(2)
+    found = judged(bench.document()).as_json()
+    assert found["faults"]
+    assert found["troubles"] == found["faults"]
 
 
 def test_missing_telemetry_is_no_fault_in_quiet_mode() -> None:
@@ -160,7 +169,7 @@ def test_each_fault_is_reported_as_a_sentence(
         facts = {"ports": [LOST._replace(lost_since_ns=bench.now - 70 * SECOND)]}
     seen = judged(bench.document(**facts))
     assert seen.code == (TROUBLE if said else HEALTHY)
-    assert list(seen.troubles) == said
+    assert list(seen.faults) == said
 
 
 def test_the_last_recorded_event_and_its_file_are_shown() -> None:

@@ -346,7 +346,7 @@ class World:
         Its argument is True if the poll is for all descriptors.
         """
         self.until = 1 << 62
-        """The time at which turns in C end."""
+        """The time at which iterations in C end."""
         self.opening_ns = 0
         self.there = True
         self.blind: set[int] = set()

@@ -341,7 +341,7 @@ class Sig:
         return value * Fraction(factor) + Fraction(shift)
 
     def right(self, esc: EscTelemetry, gateway: GatewayStatus, now: int) -> int:
-        """Return the correct raw value: the nearest one, halves up."""
+        """Return the correct raw value: the nearest one, half up."""
         value = KNOWN[self.source].read(esc, gateway, now)
         return self.rule.sent(None if value is None else Fraction(value))
 
@@ -404,7 +404,7 @@ class Msg:
         return [*sorted({int(signal.mux[1:]) for signal in multiplexed})]
 
     def page_of(self, number: int | None) -> list[Sig]:
-        """Return the signals in a frame of this page."""
+        """Return the signals in a frame of this group."""
         return [s for s in self.signals if not s.mux.startswith("m") or s.mux == f"m{number}"]
 
 
@@ -526,7 +526,7 @@ class LayoutMaker:
         return message
 
     def _add_pages(self, message: Msg, common: set[tuple[int, int]]) -> None:
-        """Add a selector and the signals of 1 to 3 pages, if there is a place for the selector."""
+        """Add a selector and the signals of 1 to 3 groups, if there is a place for the selector."""
         rng = self.rng
         width = rng.randint(1, 8)
         place = self._position(common, width, message.length)
@@ -537,7 +537,7 @@ class LayoutMaker:
         numbers = range(1 << width)
         used: set[tuple[int, int]] = set()
         for page in rng.sample(numbers, min(len(numbers), rng.randint(1, 3))):
-            taken = set(common)  # pages may overlap
+            taken = set(common)  # groups may overlap
             for _ in range(rng.randint(1, 3)):
                 self._add(message, taken, f"m{page}")
             used |= taken

@@ -63,7 +63,7 @@ def test_random_frames_are_decoded_as_cantools_does(seed: int) -> None:
 
 
 def random_frame(rng: random.Random, message: Msg) -> tuple[bytes, int | None]:
-    """Return the data of a frame, and its page."""
+    """Return the data of a frame, and its group."""
     size = message.length
     fills = rng.randbytes(size), bytes(size), b"\xff" * size
     data = bytearray(rng.choice(fills))
@@ -115,7 +115,7 @@ def check_values(
 
 
 def same_frame(one: SignalPlan, other: SignalPlan) -> bool:
-    """Return True if both are on the same page and from the same kind of UART frame of an ESC."""
+    """Return True if both are on the same group and from the same kind of UART frame of an ESC."""
     assert one.source is not None
     assert other.source is not None
     if one.source.group != other.source.group:

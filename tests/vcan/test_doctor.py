@@ -126,7 +126,7 @@ def shown(name: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def test_a_parcel_of_a_running_gateway_has_its_state_and_a_capture(
+def test_a_bundle_of_a_running_gateway_has_its_state_and_a_capture(
     vcan: str,
     tmp_path: Path,
 ) -> None:
@@ -135,12 +135,12 @@ def test_a_parcel_of_a_running_gateway_has_its_state_and_a_capture(
     with chain(vcan, tmp_path, Identity(1), toml=record) as run, run.running() as gateway:
         run.feed(times=20)
         wait_for(lambda: data_blocks(tmp_path / "captures") > 0, "data in the capture")
-        parcel = tmp_path / "parcel.zip"
+        bundle = tmp_path / "bundle.zip"
         messages = io.StringIO()
         with contextlib.redirect_stderr(messages):
-            assert main(["doctor", "-c", str(run.config), "--parcel", str(parcel)]) == 0
+            assert main(["doctor", "-c", str(run.config), "--bundle", str(bundle)]) == 0
         assert "status:" not in messages.getvalue()
-        with zipfile.ZipFile(parcel) as found:
+        with zipfile.ZipFile(bundle) as found:
             found.extractall(tmp_path / "out")
         status = json.loads((tmp_path / "out/status.json").read_text())
         assert gateway.end() == 0, gateway.log

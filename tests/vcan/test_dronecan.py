@@ -1,6 +1,6 @@
 """A gateway process with DroneCAN nodes of 1 and 4 ESCs, and the package ``dronecan``.
 
-The package is monitor, allocator and client.
+The package is monitor, allocation server and client.
 """
 
 from collections.abc import Callable

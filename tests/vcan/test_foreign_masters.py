@@ -36,7 +36,7 @@ Start = Callable[..., GatewayProcess]
 PRODUCT = 0x4B4F4E01
 REVISION = 0x00010000
 LOSES = "telemetry_timeout_ms = 10000"
-"""Time-out if telemetry must be lost. It is longer than any hold-up of the machine."""
+"""Timeout if telemetry must be lost. It is longer than any hold-up of the machine."""
 BOOT_UP = 0
 STOPPED = 4
 OPERATIONAL = 5

@@ -4,7 +4,7 @@
     tests/vm/run --which            prints the backend that `auto` chooses, or none
 
 Prints the output of COMMAND, with stdout and stderr separate, and exits with its exit code. The
-exit code is 124 after a time-out, and 125 if the VM failed. COMMAND finds the programs of .venv
+exit code is 124 after a timeout, and 125 if the VM failed. COMMAND finds the programs of .venv
 first. `make test` sets up .venv and a virtual machine.
 
 native  COMMAND itself. If it may not create interfaces, it runs in a separate network namespace, by

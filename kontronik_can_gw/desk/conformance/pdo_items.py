@@ -190,7 +190,11 @@ def pdo_none_while_stopped(slave: Slave) -> str:
     return "no TPDO"
 
 
-@item("CiA 301, 1800h:5", "type 254 with an event timer of 100 ms", "at least 8 TPDOs a second")
+@item(
+    "CiA 301, 1800h:5",
+    "transmission type 254 with an event timer of 100 ms",
+    "at least 8 TPDOs a second",
+)
 def pdo_event_timer(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     if not slave.has(_COMMUNICATION, 5):
@@ -261,7 +265,7 @@ def pdo_remote_types(slave: Slave) -> str:
 
 @item(
     "CiA 301, 1800h:3",
-    "type 254 with an event timer of 20 ms and an inhibit time of 100 ms",
+    "transmission type 254 with an event timer of 20 ms and an inhibit time of 100 ms",
     "at most 12 TPDOs a second",
     needs="pdo-event-timer",
 )

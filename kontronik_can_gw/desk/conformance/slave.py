@@ -148,7 +148,7 @@ class Slave:
         raise NoAnswer
 
     def answers_until_answer(self) -> list[ReceivedFrame]:
-        """Read the device type and return the SDO answers that arrived before its answer.
+        """Read the device type and return the SDO responses that arrived before its answer.
 
         Raises NoAnswer after the time limit.
         """
@@ -302,7 +302,7 @@ class Slave:
 
 
 class UnexpectedAnswer(Exception):
-    """An SDO answer does not fit its request."""
+    """An SDO response does not fit its request."""
 
     def __init__(self, answer: bytes, reason: str = "") -> None:
         shown = f"answer {answer.hex(' ').upper()}"

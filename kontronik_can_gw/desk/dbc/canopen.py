@@ -121,7 +121,7 @@ def _about(nodes: Nodes, escs: Sequence[EscSettings]) -> str:
 
 
 class _Schedule(NamedTuple):
-    """The send type of a message, with its period and its minimum distance in ms."""
+    """The send type of a message, with its period and its minimum delay time in ms."""
 
     send_type: str
     cycle_ms: int = 0

@@ -81,8 +81,8 @@ def copies_text(
     """Return a database as text.
 
     ``copies``: its messages as they are sent. None: the messages of the database unchanged.
-    ``data_ids``: E2E data ids with which messages are sent, by ``Copy.key``. They replace those of
-    the attributes, because the copies of a message for several ESCs have data ids of their own.
+    ``data_ids``: E2E data IDs with which messages are sent, by ``Copy.key``. They replace those of
+    the attributes, because the copies of a message for several ESCs have data IDs of their own.
     """
     if copies is None:
         copies = [Copy(message) for message in database.messages]

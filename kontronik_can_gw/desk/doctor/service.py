@@ -14,7 +14,7 @@ _MIN_BYTES = 1_000_000
 _BOOTED = "/run/systemd/system"
 """Exists if systemd runs (sd_booted)."""
 _WITHOUT_JOURNAL = ("vfat", "msdos", "exfat")
-"""File systems in which a loss of power while a file is replaced may destroy it."""
+"""File systems in which a power loss while a file is replaced may destroy it."""
 _UNIT_FOLDERS = ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system")
 
 
@@ -111,7 +111,7 @@ def check_folder(
 
 
 def check_file_system(machine: Machine, findings: Findings, what: str, folder: str) -> None:
-    """Check that files of a folder can be replaced safely, so that a loss of power is harmless."""
+    """Check that files of a folder can be replaced safely, so that a power loss is harmless."""
     kind = machine.file_system(str(_existing(machine, folder)))
     if kind in _WITHOUT_JOURNAL:
         findings.add("config.file_system", "unsafe", what=what, folder=folder, kind=kind)

@@ -71,7 +71,7 @@ class Seen:
     file: Path
     code: int
     sentence: str
-    troubles: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
     age_s: float | None = None
     document: Document | None = None
     is_missing: bool = False
@@ -84,7 +84,8 @@ class Seen:
             "file": printable(str(self.file)),
             "exit_code": self.code,
             "status": self.sentence,
-            "troubles": list(self.troubles),
+            "faults": list(self.faults),
+            "troubles": list(self.faults),  # the old name, until 2027-12-01
             "age_s": None if self.age_s is None else round(self.age_s, 3),
             "document": self.document,
         }
@@ -211,15 +212,15 @@ def _judge(file: Path, document: Document, now: int) -> Seen:
         if age > 0:
             text = f"has written nothing for {duration(age)} (ended, blocked, or the disk is full)"
         return Seen(file, NOT_RUNNING, text, (), age_s, document)
-    troubles = tuple(map(printable, _troubles(document)))
+    faults = tuple(map(printable, _faults(document)))
     sentence = printable(document["gateway"]["state"])
-    if not troubles:
+    if not faults:
         return Seen(file, HEALTHY, sentence, (), age_s, document)
-    count = "1 fault" if len(troubles) == 1 else f"{len(troubles)} faults"
-    return Seen(file, TROUBLE, f"{sentence}, {count}", troubles, age_s, document)
+    count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
+    return Seen(file, TROUBLE, f"{sentence}, {count}", faults, age_s, document)
 
 
-def _troubles(document: Document) -> Iterator[str]:
+def _faults(document: Document) -> Iterator[str]:
     can = document["can"]
     channel = f"CAN {can['channel']}"
     if not can["open"] or can["state"] == "down":
@@ -271,8 +272,8 @@ def lines_of(seen: Seen) -> Iterator[Text]:
         yield line()
         rows = list(_esc_rows(document))
         yield from table(rows, _WIDTH, 2, tuple(_WIDTHS.values()))
-        for trouble in seen.troubles:
-            yield from wrapped(trouble, "bold red", _WIDTH)
+        for fault in seen.faults:
+            yield from wrapped(fault, "bold red", _WIDTH)
         yield from alarm_lines(alarms(document), _WIDTH)
         yield from _further(document)
     if document["log"]:

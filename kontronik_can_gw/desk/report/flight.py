@@ -2,7 +2,7 @@
 
 Pure functions of the rows, in one pass, with bounded memory. Values are found by name, so any
 recording and any DBC can be used. Missing values are left out. If two rows are further apart than
-the time-out, there is a gap between them. Times are ns of the recording's clock.
+the timeout, there is a gap between them. Times are ns of the recording's clock.
 """
 
 from collections.abc import Sequence

@@ -72,7 +72,11 @@ def _sizes() -> str:
         ("KCG_LONGEST_FRAME", MAX_LENGTH, "bytes, with header and CRC"),
         ("KCG_MAX_HELD", MAX_LENGTH - 1, "bytes that can be undecided"),
         ("KCG_VARIANT_BITS", VARIANT_BITS, "low bits of device_and_variant"),
-        ("KCG_LARGEST_STATE", int(LARGEST_STATE), "of operating_state, as far as the sheet has it"),
+        (
+            "KCG_LARGEST_STATE",
+            int(LARGEST_STATE),
+            "of operating_state, as far as the protocol specification has it",
+        ),
     )
     lines = [f"enum {{ {name} = {number} }}; /* {about} */" for name, number, about in numbers]
     return "\n".join([*lines, ""])

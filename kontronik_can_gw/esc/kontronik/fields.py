@@ -1,7 +1,7 @@
-"""One typed line for each row of the sheet: wire order, type, step, unit, absence.
+"""One typed line for each row of the protocol specification: wire order, type, step, unit, absence.
 
 LiveData and InfoData hold integers as they are on the wire. Nothing is clipped: a value that fits
-the wire type is passed on even if it is outside the range in the sheet.
+the wire type is passed on even if it is outside the range in the protocol specification.
 """
 
 import struct
@@ -11,7 +11,7 @@ from kontronik_can_gw.esc.kontronik.states import Device
 
 
 class Row(NamedTuple):
-    """A row of the sheet."""
+    """A row of the protocol specification."""
 
     wire: str
     """struct code of the wire type."""

@@ -26,7 +26,7 @@ _PEAK_CURRENTS = {
     int(device): device.peak_current_of for device in Device if device.peak_current_of is not None
 }
 _SPLIT_ROWS = ("operating_state", "device_and_variant", "firmware_word")
-"""Rows of the sheet that are published as several fields. These are listed in KONTRONIK."""
+"""Rows of the specification that are published as several fields. KONTRONIK lists these."""
 
 
 def _whole_fields(data: DataType) -> list[Field]:

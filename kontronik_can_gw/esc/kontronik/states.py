@@ -40,7 +40,7 @@ class OperatingState(IntEnum):
 
     All recorded idle frames contain 12. A member is written
     ``NAME = (number, meaning, kind, phase, remedy)``, as described in ``State``. Its name is the
-    spelling of the sheet, which describes nothing but the names.
+    spelling of the protocol specification, which describes nothing but the names.
     """
 
     about: State
@@ -88,8 +88,8 @@ class OperatingState(IntEnum):
 LARGEST_STATE = max(OperatingState)
 
 
-# The parts of a member are described in ``ErrorBit``. The sheet has no remedies: they are common
-# practice with any ESC.
+# The parts of a member are described in ``ErrorBit``. The protocol specification has no remedies:
+# they are common practice with any ESC.
 _E = Severity.ERROR
 _W = Severity.WARNING
 _S = Severity.STATUS

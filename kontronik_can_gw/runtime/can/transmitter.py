@@ -19,7 +19,7 @@ from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.times import MS, SECOND
 
 MAX_LATE_NS = 250 * MS
-"""Longest delay of a measurement. The shortest telemetry time-out may be a lower limit."""
+"""Longest delay of a measurement. The shortest telemetry timeout may be a lower limit."""
 _OK = Sent.OK  # an enumeration's members are slow to look up
 
 

@@ -5,7 +5,7 @@ the recorder's thread, and the functions that it calls access the disk. Entries 
 bounded deque. Entries that do not fit are counted, and the count is recorded as soon as there is
 room again.
 
-Every half second, the entries are written as one block and forced to the disk, so a loss of power
+Every half second, the entries are written as one block and forced to the disk, so a power loss
 costs no more than that. A fault of the disk is reported once and the disk is tried again every five
 seconds. It ends neither the gateway nor the recorder.
 """

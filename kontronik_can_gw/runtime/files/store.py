@@ -7,7 +7,7 @@ read-only or slow disk does not delay the loop.
 A file is never changed, but replaced: write a temporary file in the same folder, fsync, rename,
 fsync of the folder. This guarantees:
 
-1. After a loss of power at any instant, the file has either the old or the new content.
+1. After a power loss at any instant, the file has either the old or the new content.
 2. After a successful result of a saving, it has the new content.
 3. After a failed saving, it has the old content, or the new one if only the last step failed.
 """

@@ -174,7 +174,7 @@ class Statistics:
         """Replace the file, so that a reader always finds the whole old or new content.
 
         The content is forced to the disk first. Otherwise the file may be empty or full of zeros
-        after a loss of power.
+        after a power loss.
         """
         path = self._path
         temporary = self._temporary

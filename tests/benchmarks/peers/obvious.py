@@ -1,4 +1,4 @@
-"""The obvious program: the first version that a competent programmer would write.
+"""The baseline program: the first version that a competent programmer would write.
 
     python obvious.py DBC CHANNEL PORT...
 

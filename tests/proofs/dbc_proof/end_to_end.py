@@ -20,11 +20,11 @@ class CrcRule(NamedTuple):
     start: int
     final_xor: int
     id_bytes: int
-    """Number of bytes of a data id in the CRC."""
+    """Number of bytes of a data ID in the CRC."""
     is_id_last: bool
-    """True if the data id follows the frame, False if it precedes the frame."""
+    """True if the data ID follows the frame, False if it precedes the frame."""
     data_ids: tuple[int, ...]
-    """The bytes of the data id as a number, for each counter modulo 16."""
+    """The bytes of the data ID as a number, for each counter modulo 16."""
 
 
 COUNTERS = {"1A": 15, "1B": 15, "1C": 15, "2": 16, "5": 256, "11A": 15, "11C": 15, "22": 16}
@@ -32,7 +32,7 @@ COUNTERS = {"1A": 15, "1B": 15, "1C": 15, "2": 16, "5": 256, "11A": 15, "11C": 1
 
 
 def expected_rule(profile: str, data_ids: tuple[int, ...]) -> CrcRule:
-    """Return the CRC of a message with this profile and these data ids."""
+    """Return the CRC of a message with this profile and these data IDs."""
     if profile in ("2", "22"):
         ids = tuple(number & 0xFF for number in data_ids)
         return CrcRule(0x2F, 8, 0xFF, 0xFF, id_bytes=1, is_id_last=True, data_ids=ids)

@@ -2,7 +2,7 @@
 
 This is the specification of the proof. The rest of the package supplies only the user's input: the
 DBC as cantools reads it, the names to which signals bind, the roles of counters and CRCs, E2E
-profiles and data ids, and the spellings of units. Limits, codes, factors and bit positions are
+profiles and data IDs, and the spellings of units. Limits, codes, factors and bit positions are
 derived here a second time, from the text of docs/dbc.md and docs/your-own-dbc.md. Messages, CAN ids
 and the ESC of each copy are derived in messages.py.
 """
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExpectedSignal:
-    """A signal on one page."""
+    """A signal on one group."""
 
     name: str
     source: str
@@ -133,7 +133,7 @@ def _protection(
     binder: Binder,
     settings: DbcConfig,
 ) -> tuple[str, tuple[int, ...]] | None:
-    """Return E2E profile and data ids of a message. None without a CRC."""
+    """Return E2E profile and data IDs of a message. None without a CRC."""
     if not _has_crc(database, sent, binder):
         return None
     profile, _ = stated_profile(settings, database, sent.for_binder)
@@ -193,7 +193,7 @@ class _Signal:
         self.binder = binder
         self.settings = settings
         self.protection = protection
-        """E2E profile and data ids of the message. None without a CRC."""
+        """E2E profile and data IDs of the message. None without a CRC."""
         self.unit = _unit(signal, settings)
         start, has_own_start = self._start_value()
         self.described = Described(
@@ -209,7 +209,7 @@ class _Signal:
         )
 
     def made(self, page: int | None) -> ExpectedSignal:
-        """Return the specification on a page."""
+        """Return the specification on a group."""
         name = self.sent.prefix + self.signal.name
         bits = bits_of(self.signal)
         source = ""
@@ -229,7 +229,7 @@ class _Signal:
                 if not value.supplied:
                     reason = "its protocol does not supply the value"
                 elif value.name not in QUANTITIES:
-                    reason = f"{value.name} is not in the sheet of the proof"
+                    reason = f"{value.name} is not in the protocol specification of the proof"
                 else:
                     quantity = QUANTITIES[value.name]
                     conversion = _conversion(quantity.unit, self.unit)
@@ -244,7 +244,7 @@ class _Signal:
 
     @property
     def _has_data_id_nibble(self) -> bool:
-        """True if the frame contains 4 bits of the data id."""
+        """True if the frame contains 4 bits of the data ID."""
         return self.protection is not None and self.protection[0] in ("1C", "11C")
 
     def _start_value(self) -> tuple[int | None, bool]:

@@ -288,7 +288,7 @@ class _World:
         return available, z3.If(available, sent, z3.IntVal(rule.not_available))
 
     def _rounded(self, y: Any) -> Any:
-        """Return the raw value for a number of steps: rounded once, halves up."""
+        """Return the raw value for a number of steps: rounded once, half up."""
         rule = self.expected
         assert rule.quantity is not None
         nought = rule.exact(Fraction(0))

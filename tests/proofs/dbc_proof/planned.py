@@ -131,7 +131,7 @@ class PlannedMessage:
     crc_at: int
     """Byte of the CRC."""
     constants: Mapping[int | None, int]
-    """Constant bits of a frame by page."""
+    """Constant bits of a frame by group."""
     sending: Sending
     signals: tuple[PlannedSignal, ...] = ()
     wrong_rows: tuple[str, ...] = ()
@@ -352,7 +352,7 @@ def wrong_tables(
 ) -> Iterator[str]:
     """Yield numbers of kcg_plan and its tables that contradict the messages.
 
-    ``expected`` has the number of pages and the timing of each message.
+    ``expected`` has the number of groups and the timing of each message.
     """
     counts = tables.counts
     wanted = {

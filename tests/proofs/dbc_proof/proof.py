@@ -171,7 +171,7 @@ class Prover:
         plans: Sequence[PlannedMessage],
         findings: Findings,
     ) -> None:
-        """Add the result of a signal on all of its pages, for each core."""
+        """Add the result of a signal on all of its groups, for each core."""
         refuted: list[str] = []
         reasons: list[str] = []
         for signal in pages:
@@ -299,14 +299,14 @@ def _frame_problems(expected: ExpectedMessage, plan: PlannedMessage) -> Iterator
     known = {(signal.name, signal.page) for signal in expected.signals}
     for signal in plan.signals:
         if (signal.name, signal.page) not in known:
-            yield f"{signal.name} is sent on page {signal.page}, where the DBC has no such signal"
+            yield f"{signal.name} is sent on group {signal.page}, where the DBC has no such signal"
     if tuple(plan.constants) != expected.pages:
-        yield f"is sent with the pages {[*plan.constants]}, not {[*expected.pages]}"
+        yield f"is sent with the groups {[*plan.constants]}, not {[*expected.pages]}"
     for page, bits in plan.constants.items():
         if expected.multiplexer:
             number = _read(expected.multiplexer, bits)
             if number != (page or 0):
-                yield f"page {page} is sent as page {number}"
+                yield f"group {page} is sent as group {number}"
         own = set(expected.multiplexer)
         for each in expected.signals:
             is_constant = each.rule is not None and each.rule.shape is Shape.CONSTANT

@@ -39,7 +39,7 @@ class Sending:
     follows_gateway: bool
     """A changed value of the gateway requests the message."""
     untimed: bool
-    """It has neither cycle nor minimum delay time nor several pages."""
+    """It has neither cycle nor minimum delay time nor several groups."""
     events: int
     """Bits of the events that request the message."""
     escs: tuple[int, ...]

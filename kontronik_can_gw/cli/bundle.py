@@ -1,6 +1,6 @@
-"""Makes the support parcel of `doctor --parcel`: the output of other commands, files and captures.
+"""Makes the support bundle of `doctor --bundle`: the output of other commands, files and captures.
 
-The parcel is written even if the gateway does not run, the configuration has mistakes, or files
+The bundle is written even if the gateway does not run, the configuration has mistakes, or files
 cannot be read. Each missing part is reported in one line.
 """
 
@@ -18,11 +18,8 @@ from kontronik_can_gw.cli.desk import watched
 from kontronik_can_gw.cli.output import check_output, configuration_files, writing
 from kontronik_can_gw.cli.recording import record_folder
 from kontronik_can_gw.config.parse import load
-from kontronik_can_gw.desk.doctor import Finding
-from kontronik_can_gw.desk.doctor.machine import Machine
-from kontronik_can_gw.desk.doctor.service import ServiceUnit, unit_of
-from kontronik_can_gw.desk.parcel.archive import write_archive
-from kontronik_can_gw.desk.parcel.parts import (
+from kontronik_can_gw.desk.bundle.archive import write_archive
+from kontronik_can_gw.desk.bundle.parts import (
     Contents,
     add_captures,
     add_configuration,
@@ -30,7 +27,10 @@ from kontronik_can_gw.desk.parcel.parts import (
     add_versions,
     known_secrets,
 )
-from kontronik_can_gw.desk.parcel.secrets import Cleaner
+from kontronik_can_gw.desk.bundle.secrets import Cleaner
+from kontronik_can_gw.desk.doctor import Finding
+from kontronik_can_gw.desk.doctor.machine import Machine
+from kontronik_can_gw.desk.doctor.service import ServiceUnit, unit_of
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.runtime.status.facts import utc
 
@@ -39,25 +39,25 @@ _RUNNING = (0, 1)
 """Exit codes of `status` for a running gateway."""
 
 
-def write_parcel(
+def write_bundle(
     args: argparse.Namespace,
     machine: Machine,
     config: Path,
     findings: Sequence[Finding],
     report: Callable[[Sequence[Finding]], Iterable[str]],
 ) -> int:
-    """Write the parcel of a configuration. Returns the exit code.
+    """Write the bundle of a configuration. Returns the exit code.
 
     ``findings`` are the results of doctor, and ``report`` returns their lines.
     """
-    if args.parcel == "-":
-        raise UserError("--parcel: a zip file cannot be shown. Give the name of a file.")
+    if args.bundle == "-":
+        raise UserError("--bundle: a zip file cannot be shown. Give the name of a file.")
     inputs = [config]
     with suppress(UserError):
         inputs = configuration_files(config)
-    check_output(args.parcel, inputs, force=args.force)
-    if Path(args.parcel).exists() and not Path(args.parcel).is_file():
-        raise UserError(f"{args.parcel}: is not a regular file. Give another name.")
+    check_output(args.bundle, inputs, force=args.force)
+    if Path(args.bundle).exists() and not Path(args.bundle).is_file():
+        raise UserError(f"{args.bundle}: is not a regular file. Give another name.")
     made_ns = time.time_ns()
     contents = Contents(Cleaner(known_secrets(config)))
     _add_findings(contents, findings, report)
@@ -76,12 +76,12 @@ def write_parcel(
         unit = unit_of(machine, str(config.absolute()))
         folders = capture_folders(machine, config, unit, document)
         add_captures(contents, folders, with_dbc=not args.without_dbc, watch=_watched)
-    with writing(args.parcel, force=args.force) as out:
+    with writing(args.bundle, force=args.force) as out:
         write_archive(out.open(), contents, made_ns)
         out.is_whole = True
     for line in contents.missing:
         say(contents.cleaner.text(f"missing: {line}", "messages"), "doctor")
-    say(f"{args.parcel} written. README.txt in it lists the removed secrets.", "doctor")
+    say(f"{args.bundle} written. README.txt in it lists the removed secrets.", "doctor")
     return 0
 
 

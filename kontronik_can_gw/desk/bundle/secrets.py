@@ -78,7 +78,7 @@ def is_secret_name(name: str) -> bool:
 
 
 class Cleaner:
-    """Removes secrets, and counts them for each part of the parcel.
+    """Removes secrets, and counts them for each part of the bundle.
 
     ``known`` maps values that must not leave the machine to their names.
     """

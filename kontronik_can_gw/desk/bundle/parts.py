@@ -1,4 +1,4 @@
-"""Collects the parts of a support parcel.
+"""Collects the parts of a support bundle.
 
 A part that cannot be made is a line in ``Contents.missing``, and the others are made nevertheless.
 """
@@ -19,10 +19,10 @@ from kontronik_can_gw import __version__
 from kontronik_can_gw.capture.format import SUFFIX
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import SHIPPED
+from kontronik_can_gw.desk.bundle.captures import clean_capture
+from kontronik_can_gw.desk.bundle.files import OPTIONS, clean_dbc, clean_eds, clean_toml, tables_of
+from kontronik_can_gw.desk.bundle.secrets import Cleaner, values_of_secrets
 from kontronik_can_gw.desk.doctor.machine import Machine
-from kontronik_can_gw.desk.parcel.captures import clean_capture
-from kontronik_can_gw.desk.parcel.files import OPTIONS, clean_dbc, clean_eds, clean_toml, tables_of
-from kontronik_can_gw.desk.parcel.secrets import Cleaner, values_of_secrets
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.native.objects import shared_object
 from kontronik_can_gw.printable import printable, printable_json
@@ -55,7 +55,7 @@ _LIBRARIES = (
 
 
 class BundlePart(NamedTuple):
-    """A file of the parcel."""
+    """A file of the bundle."""
 
     name: str
     size: int

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from kontronik_can_gw.capture.format import Damage, Scanner, block, json_payload, read_json
-from kontronik_can_gw.desk.parcel.files import clean_dbc, clean_eds, clean_toml
-from kontronik_can_gw.desk.parcel.secrets import Cleaner
+from kontronik_can_gw.desk.bundle.files import clean_dbc, clean_eds, clean_toml
+from kontronik_can_gw.desk.bundle.secrets import Cleaner
 
 
 def clean_capture(

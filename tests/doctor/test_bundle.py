@@ -1,4 +1,4 @@
-"""`doctor --parcel`: the zip file is complete, has no secret, and is written in every situation."""
+"""`doctor --bundle`: the zip file is complete, has no secret, and is written in every situation."""
 
 import contextlib
 import errno
@@ -31,15 +31,15 @@ from kontronik_can_gw.capture.format import (
     json_payload,
     read_json,
 )
-from kontronik_can_gw.cli.parcel import capture_folders
+from kontronik_can_gw.cli.bundle import capture_folders
 from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.keys import shipped
+from kontronik_can_gw.desk.bundle import archive
+from kontronik_can_gw.desk.bundle.archive import write_archive
+from kontronik_can_gw.desk.bundle.captures import clean_capture
+from kontronik_can_gw.desk.bundle.parts import Contents, add_journal
+from kontronik_can_gw.desk.bundle.secrets import Cleaner
 from kontronik_can_gw.desk.doctor.service import ServiceUnit
-from kontronik_can_gw.desk.parcel import archive
-from kontronik_can_gw.desk.parcel.archive import write_archive
-from kontronik_can_gw.desk.parcel.captures import clean_capture
-from kontronik_can_gw.desk.parcel.parts import Contents, add_journal
-from kontronik_can_gw.desk.parcel.secrets import Cleaner
 from kontronik_can_gw.desk.recordings.inputs import open_input
 
 pytestmark = pytest.mark.promise("support-bundle")
@@ -48,7 +48,7 @@ SECRETS = ("hunter2", "c0rrect h0rse", "t0k3n", "c0mment", "s3ed", "p1ace", "acc
 CONFIGURATION = """# the broker's password: hunter2 (c0mment)
 [can]
 interface = "virtual"
-channel = "parcel"
+channel = "bundle"
 options.access_code = "acc3ss"
 [dbc]
 file = "car.dbc"
@@ -88,10 +88,10 @@ def setup(tmp_path: Path) -> Path:
     return file
 
 
-def parcel(file: Path, *words: object) -> tuple[Done, dict[str, bytes]]:
-    """Make a parcel. Return the result of the command and the files in the parcel."""
-    path = file.parent / "parcel.zip"
-    done = run("doctor", "-c", file, "--parcel", path, "--force", *words)
+def bundle(file: Path, *words: object) -> tuple[Done, dict[str, bytes]]:
+    """Make a bundle. Return the result of the command and the files in the bundle."""
+    path = file.parent / "bundle.zip"
+    done = run("doctor", "-c", file, "--bundle", path, "--force", *words)
     return done, opened(path)
 
 
@@ -102,7 +102,7 @@ def opened(path: Path) -> dict[str, bytes]:
 
 
 def everything(files: dict[str, bytes]) -> str:
-    """Return all texts in the parcel, also the inflated blocks of captures."""
+    """Return all texts in the bundle, also the inflated blocks of captures."""
     texts = []
     for name, data in files.items():
         texts += [name, data.decode("utf-8", "replace"), data.decode("latin-1")]
@@ -119,8 +119,8 @@ def blocks(data: bytes) -> list[Block]:
 # --- content
 
 
-def test_the_parcel_has_all_parts_and_no_secret(setup: Path) -> None:
-    done, files = parcel(setup)
+def test_the_bundle_has_all_parts_and_no_secret(setup: Path) -> None:
+    done, files = bundle(setup)
     assert done.code == 0, done
     assert done.out == ""
     assert set(files) == {
@@ -148,8 +148,16 @@ def test_the_parcel_has_all_parts_and_no_secret(setup: Path) -> None:
     assert str(setup) not in versions["sha256"], "the digest of a file with a secret"
 
 
+def test_the_old_name_of_the_option_writes_the_same_bundle(setup: Path, tmp_path: Path) -> None:
+    path = tmp_path / "old.zip"
+    assert run("doctor", "-c", setup, "--parcel", path, "--without-captures").code == 0
+    with zipfile.ZipFile(path) as found:
+        assert "doctor.txt" in found.namelist()
+    assert "--parcel" not in run("doctor", "--help").out
+
+
 def test_the_readme_lists_what_was_removed_and_what_is_missing(setup: Path) -> None:
-    done, files = parcel(setup)
+    done, files = bundle(setup)
     readme = files["README.txt"].decode()
     for line in (
         "configuration/gateway.toml: 2 x comment",
@@ -167,16 +175,16 @@ def test_the_readme_lists_what_was_removed_and_what_is_missing(setup: Path) -> N
     ]
 
 
-def test_only_the_owner_may_read_the_parcel(setup: Path) -> None:
-    parcel(setup)
-    assert stat.S_IMODE((setup.parent / "parcel.zip").stat().st_mode) == 0o600
+def test_only_the_owner_may_read_the_bundle(setup: Path) -> None:
+    bundle(setup)
+    assert stat.S_IMODE((setup.parent / "bundle.zip").stat().st_mode) == 0o600
 
 
 def test_options_leave_out_captures_and_the_dbc(setup: Path) -> None:
-    done, files = parcel(setup, "--without-captures")
+    done, files = bundle(setup, "--without-captures")
     assert not any(name.startswith("captures/") for name in files)
     assert "missing: captures: left out by --without-captures" in done.err
-    done, files = parcel(setup, "--without-dbc")
+    done, files = bundle(setup, "--without-dbc")
     assert "EscStatus" not in everything(files).replace("EscStatus:", "")
     assert "missing: dbc: left out by --without-dbc" in done.err
     header = read_json(blocks(files["captures/newest.kcap"])[0].payload)
@@ -197,7 +205,7 @@ def test_holes_of_a_sparse_capture_are_not_read(setup: Path, tmp_path: Path) -> 
             file.truncate(end)
         except OSError as error:
             pytest.skip(f"this file system has no sparse file of 8 TB: {error}")
-    done, files = parcel(setup)
+    done, files = bundle(setup)
     assert done.code == 0, done.err
     kept = [found.number for found in blocks(files[f"captures/{path.name}"])]
     assert kept == [found.number for found in blocks(begin)] + [7]
@@ -205,16 +213,16 @@ def test_holes_of_a_sparse_capture_are_not_read(setup: Path, tmp_path: Path) -> 
 
 def test_an_existing_file_is_kept_without_force(setup: Path) -> None:
     path = written(setup.parent / "mine.zip", "x")
-    assert "exists" in refused(2, "doctor", "-c", setup, "--parcel", path)
+    assert "exists" in refused(2, "doctor", "-c", setup, "--bundle", path)
     assert path.read_text() == "x"
     link = setup.parent / "link.zip"
     link.symlink_to(path)
-    assert "exists" in refused(2, "doctor", "-c", setup, "--parcel", link)
-    assert run("doctor", "-c", setup, "--parcel", link, "--force").code == 0
+    assert "exists" in refused(2, "doctor", "-c", setup, "--bundle", link)
+    assert run("doctor", "-c", setup, "--bundle", link, "--force").code == 0
     assert not link.is_symlink()
     assert path.read_text() == "x"
-    assert "would overwrite" in refused(2, "doctor", "-c", setup, "--parcel", setup, "--force")
-    assert "cannot be shown" in refused(2, "doctor", "-c", setup, "--parcel", "-")
+    assert "would overwrite" in refused(2, "doctor", "-c", setup, "--bundle", setup, "--force")
+    assert "cannot be shown" in refused(2, "doctor", "-c", setup, "--bundle", "-")
 
 
 # --- faults
@@ -234,12 +242,12 @@ def test_an_existing_file_is_kept_without_force(setup: Path) -> None:
         (lambda file: (file.parent / "node.eds").write_text("x"), "is not an EDS"),
     ],
 )  # fmt: skip
-def test_a_fault_of_a_file_leaves_the_rest_of_the_parcel(
+def test_a_fault_of_a_file_leaves_the_rest_of_the_bundle(
     setup: Path, change: object, said: str
 ) -> None:
     assert callable(change)
     change(setup)
-    done, files = parcel(setup)
+    done, files = bundle(setup)
     assert done.code == 0
     assert "Traceback" not in done.err
     assert {"README.txt", "doctor.txt", "check.txt", "status.txt", "versions.json"} <= set(files)
@@ -250,17 +258,17 @@ def test_a_fault_of_a_file_leaves_the_rest_of_the_parcel(
 
 def test_a_password_in_place_of_its_file_is_removed(setup: Path) -> None:
     setup.write_text(CONFIGURATION.replace("pass.txt", "p1ace of a key").replace("hunter2", ""))
-    _, files = parcel(setup)
+    _, files = bundle(setup)
     assert "p1ace" not in everything(files)
 
 
-def test_a_machine_without_a_configuration_gets_a_parcel(
+def test_a_machine_without_a_configuration_gets_a_bundle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = run("doctor", "--parcel", "parcel.zip")
+    done = run("doctor", "--bundle", "bundle.zip")
     assert done.code == 0
-    assert b"cannot be read" in opened(tmp_path / "parcel.zip")["doctor.txt"]
+    assert b"cannot be read" in opened(tmp_path / "bundle.zip")["doctor.txt"]
 
 
 class Disk:
@@ -288,7 +296,7 @@ def test_on_a_full_disk_the_largest_parts_are_left_out(
 ) -> None:
     monkeypatch.setattr(archive, "write_all", Disk(room).write)
     contents = contents_of(60_000, 10_000, 100_000)
-    path = tmp_path / "parcel.zip"
+    path = tmp_path / "bundle.zip"
     with path.open("wb") as file:
         write_archive(file, contents, 1_700_000_000 * 10**9)
     files = opened(path)
@@ -303,10 +311,10 @@ def test_on_a_full_disk_the_largest_parts_are_left_out(
 
 def test_a_disk_without_any_room_is_one_line(setup: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(archive, "write_all", Disk(0).write)
-    path = setup.parent / "parcel.zip"
-    line = refused(1, "doctor", "-c", setup, "--parcel", path)
+    path = setup.parent / "bundle.zip"
+    line = refused(1, "doctor", "-c", setup, "--bundle", path)
     assert line == f"{path}: cannot be written: No space left on device."
-    assert not list(setup.parent.glob("parcel.zip*"))
+    assert not list(setup.parent.glob("bundle.zip*"))
 
 
 def test_a_limit_of_the_system_for_files_leaves_out_captures(setup: Path) -> None:
@@ -314,9 +322,9 @@ def test_a_limit_of_the_system_for_files_leaves_out_captures(setup: Path) -> Non
     big = setup.parent / "captures" / f"big{SUFFIX}"
     noise = b"".join(block(b"D", n, os.urandom(1 << 16)) for n in range(20))
     written(big, noise)
-    path = setup.parent / "parcel.zip"
+    path = setup.parent / "bundle.zip"
     command = [sys.executable, "-m", "kontronik_can_gw", "doctor"]
-    command += ["-c", str(setup), "--parcel", str(path)]
+    command += ["-c", str(setup), "--bundle", str(path)]
     done = subprocess.run(
         command,
         capture_output=True,
@@ -335,8 +343,8 @@ def test_without_rights_each_unreadable_part_is_one_line(setup: Path) -> None:
         file.chmod(0o600 if os.geteuid() != file.stat().st_uid else 0)
         closed = file.parent / "captures"
         with modes_apply(Path(place)):
-            done = run("doctor", "-c", file, "--parcel", f"{place}/out/parcel.zip")
-            files = opened(Path(place, "out/parcel.zip"))
+            done = run("doctor", "-c", file, "--bundle", f"{place}/out/bundle.zip")
+            files = opened(Path(place, "out/bundle.zip"))
         closed.chmod(0o700)
     assert done.code == 0, done
     assert "missing: configuration/gateway.toml: " in done.err

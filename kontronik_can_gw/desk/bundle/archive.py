@@ -1,4 +1,4 @@
-"""Writes the parcel as a zip file. If the disk is full, the largest parts are left out."""
+"""Writes the bundle as a zip file. If the disk is full, the largest parts are left out."""
 
 import errno
 import os
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import IO
 
 from kontronik_can_gw import __version__
-from kontronik_can_gw.desk.parcel.parts import BundlePart, Contents
+from kontronik_can_gw.desk.bundle.parts import BundlePart, Contents
 from kontronik_can_gw.runtime.files.disk import write_all
 from kontronik_can_gw.runtime.status.facts import utc
 from kontronik_can_gw.times import SECOND
@@ -63,7 +63,7 @@ class _File:
 
 
 def write_archive(file: IO[bytes], contents: Contents, made_ns: int) -> None:
-    """Write the parcel. OSError if the disk has no room even for the smallest part.
+    """Write the bundle. OSError if the disk has no room even for the smallest part.
 
     Only its owner may read the file. ``made_ns`` is the Unix time of all files in it.
     """
@@ -110,7 +110,7 @@ def _info(name: str, date: tuple[int, ...], kind: int) -> zipfile.ZipInfo:
 def readme(contents: Contents, names: Sequence[str], made_ns: int) -> str:
     """Return the text of README.txt: the parts, missing parts, and removed secrets."""
     made = utc(made_ns / SECOND)
-    lines = [f"Support parcel of kontronik-can-gw {__version__}, made {made}", "", "Files:"]
+    lines = [f"Support bundle of kontronik-can-gw {__version__}, made {made}", "", "Files:"]
     lines += [f"  {name}" for name in names]
     lines += ["", "Meaning:"]
     lines += [f"  {name:<28}{about}" for name, about in _ABOUT]

@@ -12,7 +12,7 @@ import tomllib
 from dataclasses import fields
 
 from kontronik_can_gw.config.keys import TABLES
-from kontronik_can_gw.desk.parcel.secrets import REMOVED, Cleaner, is_secret_name
+from kontronik_can_gw.desk.bundle.secrets import REMOVED, Cleaner, is_secret_name
 from kontronik_can_gw.esc.value_names import normalize
 
 COMMENT = "comment"
