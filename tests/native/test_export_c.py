@@ -145,18 +145,12 @@ def test_an_export_links_with_a_cpp_program(
 ) -> None:
     case = shipped_case
     (case.folder / "main.cpp").write_text(_FROM_CPP)
+    gcc = c_compiler("gcc")
     for source in ("core.c", "tables.c"):
-        case.output(c_compiler("gcc"), "-std=c99", "-c", source)
-    case.output(
-        c_compiler("g++"),
-        "-Wall",
-        "-Werror",
-        "-o",
-        "cpp",
-        "main.cpp",
-        "core.o",
-        "tables.o",
-    )
+        case.output(gcc, "-std=c99", "-c", source)
+    case.output(c_compiler("g++"), "-Wall", "-Werror", "-c", "main.cpp")
+    # Not by g++: Zig would first compile its whole C++ library, which the program does not use.
+    case.output(gcc, "-o", "cpp", "main.o", "core.o", "tables.o")
     assert case.output("./cpp") == ""
 
 
