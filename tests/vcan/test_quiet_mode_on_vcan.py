@@ -10,6 +10,8 @@ pytestmark = pytest.mark.promise("quiet-mode")
 
 QUIET = "quiet_after_s = 3\n"
 BEGIN = "quiet: no ESC was heard for 3"
+AFTER_BEGIN = "esc1: no telemetry: no bytes"
+"""A line of the log a second later. A late line would come after it."""
 END = "quiet mode ends: an ESC is heard"
 
 
@@ -29,7 +31,9 @@ def test_begin_and_end_of_quiet_mode_are_logged_at_once(
             ports[0].on = True
             gateway.wait_for_line("esc1: telemetry ok")
             ports[0].on = False
-            gateway.wait_for_line(BEGIN)
+            gateway.wait_for_line(AFTER_BEGIN)
+            begun = gateway.log.partition(AFTER_BEGIN)[0]
+            assert BEGIN in begun
             assert END not in gateway.log
 
             def is_listed() -> bool:
