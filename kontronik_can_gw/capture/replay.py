@@ -66,7 +66,7 @@ class Replay:
         self._counts_lost_ports = version > 1
         self._waiting = TransmitQueue()
         self._taken: list[TimedFrame] = []
-        """Frames of the last turn. The next entry shows if they were sent."""
+        """Frames of the last iteration. The next entry shows if they were sent."""
         self._started = False
         self._adopt_until: int | None = None
         """While the beginning of the run is missing, STATE entries up to the first one after this
@@ -99,15 +99,15 @@ class Replay:
 
     @property
     def frames_wait(self) -> bool:
-        """True while the next entry decides whether the frames of the last turn were sent."""
+        """True while the next entry decides whether the frames of the last iteration were sent."""
         return bool(self._taken)
 
     def add_frames(self, taken: list[TimedFrame]) -> None:
-        """Continue after a player. ``taken``: the frames of its last turn on this gateway."""
+        """Continue after a player. ``taken``: the frames of its last iteration on this gateway."""
         self._taken += taken
 
     def finish(self) -> list[TimedFrame]:
-        """Return the frames of the last turn. Must be called after the last entry."""
+        """Return the frames of the last iteration. Must be called after the last entry."""
         found = self._taken
         self._taken = []
         return found
@@ -210,7 +210,7 @@ class Replay:
 
 
 def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:
-    """Return the frames of one turn in the order in which they are passed to the interface.
+    """Return the frames of one iteration in the order in which they are passed to the interface.
 
     ``waiting`` is the transmit queue, the same one for each iteration.
     """

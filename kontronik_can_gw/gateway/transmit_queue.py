@@ -177,7 +177,7 @@ class TransmitQueue:
     def remove(self, frames: Sequence[CanFrame], count: int) -> None:
         """Remove the first ``count`` of ``frames``, which were sent. ``in_order`` returned them.
 
-        The next turn is that of the other kind than the last frame that was sent.
+        The other kind than that of the last frame that was sent is next.
         """
         if self._queued and count and len(frames) > 1:
             self._queue_has_turn = not frames[count - 1].queued

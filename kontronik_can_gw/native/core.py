@@ -244,15 +244,15 @@ class NativeCore:
         return 0 if self._slots.is_pending else self._slots.next_deadline()
 
     def turns(self) -> Turns:
-        """Return the turns of a loop with this core."""
+        """Return the iterations of a loop with this core."""
         return Turns(self.library, self.core, len(self.escs))
 
     def dispatch(self, event: int, now: int) -> None:
-        """Pass on an event that a turn returned. Further events are returned one by one."""
+        """Pass on an event that an iteration returned. Further events are returned one by one."""
         self._dispatch(event >> 8, event & 0xFF, now)
 
     def dispatch_others(self, now: int) -> None:
-        """Pass on all further events of a turn, if the loop makes the rest of it."""
+        """Pass on all further events of an iteration, if the loop makes the rest of it."""
         event = self.library.kcg_next_event(self.core)
         self._dispatch_all(event, now)
 

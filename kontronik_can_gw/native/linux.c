@@ -5,8 +5,8 @@
    gateway/transmit_queue.py (frames that wait) and runtime/can/socketcan_port.py (sending).
    Python alone decides whether a frame may leave (gateway/gate.py).
 
-   In this file "the loop" is the loop in Python. It does everything that these turns do not do: its
-   next turn follows at once with all that is ready. */
+   In this file "the loop" is the loop in Python. It does everything that these iterations
+   do not do: its next one follows at once with all that is ready. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <poll.h>
@@ -40,7 +40,7 @@ static int64_t now_ns(void)
     return t.tv_sec * INT64_C(1000000000) + t.tv_nsec;
 }
 
-/* Records a call of the core. `has_room` was true for it and for the kcg_advance of the turn. */
+/* Records a call of the core. `has_room` was true for it and for the iteration's kcg_advance. */
 static void note(kcg_turns *t, int kind, int esc, const uint8_t *data, uint32_t size, int64_t came)
 {
     if (!t->request.is_recorded)
@@ -76,7 +76,7 @@ static int fetch(kcg_turns *t, int fd, kcg_input *in)
     r->size = (uint32_t)size;
     r->since = in->undrained_ns != KCG_DRAINED ? in->undrained_ns : in->asked_ns;
     /* Bytes that this read left arrived after those that it returned. Whether it left any is polled
-       at the end of the turn. */
+       at the end of the iteration. */
     int64_t passed = r->since + size * KCG_BYTE_NS;
     in->undrained_ns = passed < t->times.now ? passed : t->times.now;
     note(t, KCG_ENTRY_BYTES, in->esc, r->data, r->size, r->since);
@@ -377,8 +377,8 @@ static void ask_all(kcg_turns *t)
         hold_settings(t);
 }
 
-/* Polls the ports that were read in this turn, because a read may have left bytes. poll, unlike
-   epoll, makes the kernel pass on bytes that it still holds further back. */
+/* Polls the ports that were read in this iteration, because a read may have left bytes. poll,
+   unlike epoll, makes the kernel pass on bytes that it still holds further back. */
 static void ask_read(kcg_turns *t)
 {
     const kcg_turn_reads *r = &t->reads;
@@ -396,7 +396,7 @@ static int64_t earlier(int64_t a, int64_t b)
     return a < b ? a : b;
 }
 
-/* Waits for the next turn and lists the ready ports. Returns 0 if the loop has to make it. */
+/* Waits for the next iteration and lists the ready ports. Returns 0 if the loop has to make it. */
 static int wait_for_turn(kcg_turns *t)
 {
     const kcg_turn_request *request = &t->request;
@@ -441,7 +441,7 @@ static int is_idle(const kcg_turns *t)
     return !t->reads.ready && t->times.now < due && !may_send;
 }
 
-/* Makes a turn, or the rest of one after an event. It ends early if there is a further event
+/* Makes an iteration, or the rest of one after an event. It ends early if there is a further event
    (result.event). Returns 0 if the loop has to do the rest. */
 static int turn(kcg_turns *t)
 {

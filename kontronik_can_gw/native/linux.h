@@ -1,4 +1,4 @@
-/* Whole turns of the gateway's loop in C, on Linux (linux.c). The owner is native/turns.py. */
+/* Whole iterations of the gateway's loop in C, on Linux (linux.c). The owner is native/turns.py. */
 #ifndef KCG_LINUX_H
 #define KCG_LINUX_H
 #include <poll.h>
@@ -41,7 +41,7 @@ typedef struct { int64_t now, came; uint32_t size; uint8_t kind, esc, reserved[2
 typedef struct {
     int64_t due;          /* Next deadline of the loop: return at this time. */
     int64_t outputs_due;  /* Next deadline of the outputs: return KCG_OUTPUTS at this time. */
-    int64_t leave;        /* Return after the first turn at this time or later. */
+    int64_t leave;        /* Return after the first iteration at this time or later. */
     int64_t period;       /* Longest time between two polls of all descriptors. */
     int64_t max_turn;     /* Do not send frames whose turn has lasted longer than this. Return if a
                              turn is later than this: the process was held up. */
@@ -62,13 +62,13 @@ typedef struct {
 
 /* The result of a run. */
 typedef struct {
-    int64_t late;      /* Time of the last turn and its wait beyond the planned pause, in ns. */
+    int64_t late;      /* Time of the last iteration and its wait beyond the planned one, in ns. */
     int32_t event;     /* An event of the core, or KCG_OUTPUTS; less than 0: none. */
     int32_t happened;  /* Result of the last poll: the number of `fds` that are ready. */
     uint32_t turns;    /* Turns since kcg_begin. */
     uint32_t taken;    /* Frames that the core and the outputs made since kcg_begin. */
     uint32_t recorded; /* Bytes in `ring`. */
-    uint32_t is_over;  /* 1: the last turn is complete, and no frame waits in `queue`. */
+    uint32_t is_over;  /* 1: the last iteration is complete, and no frame waits in `queue`. */
 } kcg_turn_result;
 
 /* The reads of the current turn. */
@@ -130,14 +130,14 @@ typedef struct {
 int kcg_watch(kcg_turns *t);
 /* Starts a run. Call it before the first kcg_turn. */
 void kcg_begin(kcg_turns *t);
-/* Makes turns until Python has something to do. The owner calls it, and the loop in Python
-   (runtime/loop.py) makes the turns that C cannot make.
+/* Makes iterations until Python has something to do. The owner calls it, and the loop in Python
+   (runtime/loop.py) makes the iterations that C cannot make.
 
-   Returns 1 for an event, in the middle of a turn. The owner handles `result.event`, and then does
-   one of these:
+   Returns 1 for an event, in the middle of an iteration. The owner handles `result.event`, and
+   then does one of these:
    a. It puts the frames that the outputs made of the event into `queue`, and calls kcg_turn again,
-      which continues the turn. After KCG_OUTPUTS, request.outputs_due must be a new time.
-   b. It calls kcg_leave. Then the loop makes the rest of the turn.
+      which continues it. After KCG_OUTPUTS, request.outputs_due must be a new time.
+   b. It calls kcg_leave. Then the loop makes the rest of the iteration.
 
    Returns 0 at the end of the run. Then the loop serves the descriptors that are ready, which are
    in `ports.fds`, and sends the frames that are left in `queue`. If result.is_over is 0, it also

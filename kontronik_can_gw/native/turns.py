@@ -31,7 +31,7 @@ _ENTRIES = _Turns.ring.offset
 
 
 class Turns:
-    """Turns of a loop whose core is in C.
+    """Iterations of a loop whose core is in C.
 
     The owner fills ``request`` and ``times``, then calls ``begin`` and ``run``, and reads
     ``result``.
@@ -62,7 +62,7 @@ class Turns:
         After an event call it again, or call ``leave``.
         """
         self.leave = partial(library.kcg_leave, address)
-        """Leave the rest of the turn to the loop."""
+        """Leave the rest of the iteration to the loop."""
         self._raw = memoryview(self._state).cast("B")
         self._output_frames: list[CanFrame] = []
         """The last frames of ``add_output_frames``: at least those that were not sent."""
@@ -123,7 +123,7 @@ class Turns:
 
     @property
     def has_advanced(self) -> bool:
-        """True if kcg_advance was called in the turn."""
+        """True if kcg_advance was called in the iteration."""
         return bool(self._reads.has_advanced)
 
     def ready(self) -> list[tuple[int, int]]:

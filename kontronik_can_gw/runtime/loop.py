@@ -216,7 +216,7 @@ class Loop:
             now = self._reopen(now)
         has_outputs = gateway.has_outputs
         if has_outputs:
-            # First, so that its answers are sent in this turn, as in a replay.
+            # First, so that its answers are sent in this iteration, as in a replay.
             self._saver.save(now)
         can.look(now)
         gateway.advance(now)

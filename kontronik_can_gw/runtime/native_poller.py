@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.can.can_port import CanPort
 
 _HANDOVER_NS = 250 * MS
-"""C hands recorded calls over after the first turn at this age. Until then, a power loss
+"""C hands recorded calls over after the first iteration at this age. Until then, a power loss
 loses them."""
 
 

@@ -64,7 +64,7 @@ class Poller:
         self._clock = clock
         self.times: Any = LoopTimes(clock())
         self.late = 0
-        """By how many ns the last turn and the wait took longer than planned."""
+        """By how many ns the last iteration and the wait took longer than planned."""
         self.changes = 0
         """Increases with each change of the watched descriptors."""
         self._poll = select.poll()
@@ -131,7 +131,7 @@ class Poller:
         return PortInput()
 
     def begin(self) -> None:
-        """Prepare for the first turn of the loop."""
+        """Prepare for the first iteration of the loop."""
 
     def watched(self) -> list[tuple[int, int, int | None]]:
         """Return the watched descriptors, with their events and the number of their ESC."""

@@ -72,7 +72,7 @@ def convert(
 
 
 def capture(context: Context, seconds: int, noise: bool = False) -> Path:
-    """Write a capture of one ESC as a recorder does, with a read and a turn for each UART frame.
+    """Write a capture of one ESC as a recorder does, with an iteration for each UART frame.
 
     With ``noise``, 5 % of the frames are damaged.
     """

@@ -80,7 +80,7 @@ class Bench:
             outputs=self.setup.outputs,
         )
         self.quiet_turns = 0
-        """Number of turns in quiet mode."""
+        """Number of iterations in quiet mode."""
         self._waiting = TransmitQueue()
         self._saves: list[int] = []
         self._is_open = True

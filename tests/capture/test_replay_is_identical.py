@@ -130,7 +130,7 @@ def test_messages_of_a_later_part_alone_are_exact_once_it_has_settled(
 
 
 def test_frames_that_waited_when_the_state_was_noted_count_as_sent() -> None:
-    """The socket takes six frames at once, so the others of a turn are sent after the state."""
+    """The socket takes six frames at once. The others of an iteration are sent after the state."""
     bench = Bench(*made(1))
     run = bench.running(1, wild=False)
     now = run(3)

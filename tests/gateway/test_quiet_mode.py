@@ -302,7 +302,7 @@ def test_quiet_mode_begins_again_after_each_silence() -> None:
 
 
 def test_after_the_end_of_quiet_mode_no_deadline_is_due_at_once() -> None:
-    """Seconds of the statistics passed in quiet mode. They end in the turn that ends the mode."""
+    """Seconds of the statistics passed in quiet mode. They end in the same iteration."""
     bench = Bench(loaded())
     bench.run(20)
     gateway = bench.gateway

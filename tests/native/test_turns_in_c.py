@@ -62,7 +62,7 @@ pytestmark = [
 
 
 class InC:
-    """A loop that runs in C, in a World. ``turns`` has the times of turns in Python."""
+    """A loop that runs in C, in a World. ``turns`` has the times of iterations in Python."""
 
     def __init__(
         self,

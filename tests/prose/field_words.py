@@ -30,7 +30,12 @@ def _term(old: str, term: str, *folders: str) -> Term:
     return Term(re.compile(old, re.IGNORECASE), term, folders or ("",))
 
 
-_ITERATION = r"(?:the|this|that|each|every|an?|one|per|next|last|same|late|whole|between|of|many)"
+_TURN = (
+    r"\bturns? of (?:its|the|a) (?:main )?loop\b|\bloop turns\b"
+    r"|\b(?:turns|a turn) in (?:C|Python)\b"
+    r"|\b(?:in|of|during) (?:a|one|the|that|this|each|every|several|many) turns?\b"
+    r"|\b(?:same|last|first|late|whole) turns?\b|\bmakes (?:a turn|turns)\b"
+)
 _DBC_FOLDERS = tuple(
     f"{top}/{name}"
     for top in ("kontronik_can_gw", "tests")
@@ -54,11 +59,7 @@ TERMS = (
     _term(r"\bin front of the driver\b", "socket queue, TX queue (qdisc), driver queue"),
     _term(r"\b99 ?%", "p99"),
     _term(_DELAYS, "latency, maximum", "docs", "tests/benchmarks"),
-    _term(
-        rf"\b{_ITERATION} turns? of (?:its|the) loop\b|\bturns of the loop\b|\bturns in C\b"
-        rf"|\bloop turns\b|\b(?:the same|a late|in one|each|every) turn\b(?! on| off)",
-        "iteration",
-    ),
+    _term(_TURN, "iteration"),
     _term(r"\bloss(?:es)? of power\b", "power loss"),
     _term(r"\bparcels?\b", "support bundle"),
     _term(r"\b(?:the|of a|by the|vendor's) sheets?\b", "protocol specification"),

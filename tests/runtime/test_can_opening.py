@@ -126,7 +126,7 @@ class Running:
     def turn_until(self, condition: Callable[[], bool]) -> None:
         """Turn the loop, woken by a frame of the ESC each time, until the condition holds.
 
-        The opener is a thread, so how many turns it takes depends on the machine. Only a hang
+        The opener is a thread, so how many iterations it takes depends on the machine. Only a hang
         reaches the limit.
         """
         end = time.monotonic() + LIMIT_S

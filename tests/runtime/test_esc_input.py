@@ -445,7 +445,7 @@ def test_an_unreadable_port_is_lost_in_that_turn_and_others_are_read(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Both ports are readable in that turn."""
+    """Both ports are readable in that iteration."""
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     world = World(2)
     failing, sound = world.wires

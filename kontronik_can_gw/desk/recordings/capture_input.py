@@ -169,7 +169,7 @@ class CaptureInput(PlayedInput):
         """Play all entries on the gateway of ``replay``. Yield the frames of each entry.
 
         The player, if there is one, plays the frequent kinds of entries. Each other entry and the
-        rest of its turn are played by ``replay``. For the player's entries an empty list is
+        rest of its iteration are played by ``replay``. For the player's entries an empty list is
         yielded; the caller takes their frames from the player.
         """
         if player is None:

@@ -191,7 +191,7 @@ class Player(Output):
     def take_frames(self, final: bool = False) -> Frames:
         """Return the frames that are certain.
 
-        Frames of the last turn are certain after the next entry, or with ``final`` (the end).
+        Frames of the last iteration are certain after the next entry, or with ``final`` (the end).
         """
         state = self._state
         sure = state.count if final else state.sure

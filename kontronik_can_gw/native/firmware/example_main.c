@@ -111,12 +111,12 @@ static void follow_bus(int64_t now)
         kcg_repeat(core, now);
 }
 
-/* One turn of the main loop. Call it every few milliseconds, or after each interrupt and at
+/* One iteration of the main loop. Call it every few milliseconds, or after each interrupt and at
    kcg_next_deadline. */
 static void turn(void)
 {
     uint8_t data[RING];
-    int64_t now = clock_ns(); /* Read before the rings: later bytes are left for the next turn. */
+    int64_t now = clock_ns(); /* First: later bytes are left for the next iteration. */
     follow_uarts(now);
     follow_bus(now);
     for (int esc = 0; esc < KCG_ESCS; esc++) {

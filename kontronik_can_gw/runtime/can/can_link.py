@@ -81,8 +81,8 @@ class CanLink:
     def due(self) -> int:
         """Time of the next call of ``reopen``, ``transmit`` or, in bus-off, ``controller.ask``.
 
-        Except in bus-off the loop asks the controller in any of its turns, and need not wake up
-        for that.
+        Except in bus-off the loop asks the controller in any of its iterations, and need not wake
+        up for that.
         """
         due = self.gate.due
         if self.controller.is_off:
@@ -105,7 +105,7 @@ class CanLink:
 
         Raises RunError if another gateway uses one of our node-IDs or sends our messages. Without
         ``wait``, RunError is also raised if the interface cannot be opened. If the thread opens
-        it, a later turn of the loop raises this error.
+        it, a later iteration of the loop raises this error.
         """
         self._own_ids.lock(at_start=True)
         try:

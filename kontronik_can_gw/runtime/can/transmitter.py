@@ -70,7 +70,7 @@ class Transmitter:
         }
 
     def max_turn_ns(self) -> int:
-        """Return the age at which a frame is too old to be sent, counted from its turn's start."""
+        """Return the age at which a frame is too old to be sent, from the iteration's start."""
         limit = self._gateway.core.shortest_timeout_ns
         return min(MAX_LATE_NS, limit)
 
@@ -85,7 +85,7 @@ class Transmitter:
             self._count_losses()
 
     def put_refused(self, frames: Sequence[CanFrame], since: int) -> None:
-        """Append frames that a turn in C could not send.
+        """Append frames that an iteration in C could not send.
 
         ``since`` is the time since which the port has accepted no frame.
         """
@@ -107,7 +107,7 @@ class Transmitter:
         1. Returns the last result of the port, or None if it was given no frame or the next
            attempt is not due yet.
         2. GONE is also returned if a port without a socket was busy for too long.
-        3. None is also returned if frames became too late meanwhile. The next turn drops them.
+        3. None is also returned if frames became too late meanwhile. The next iteration drops them.
         4. While frames are held, only the first frame is handed over.
         """
         self._is_after_advance = True
@@ -129,7 +129,7 @@ class Transmitter:
         if port is None or gate.is_off:
             return None
         if gateway.is_held:
-            # Frames that are released now are sent in the next turn, at once, as in a replay.
+            # Frames that are released now are sent in the next iteration, at once, as in a replay.
             return self._send_first_frame(port, now) if gate.wants_first_frame(now) else None
         if gate.is_limited:
             return self._send_limited(port, now)
