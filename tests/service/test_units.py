@@ -192,6 +192,14 @@ def test_the_live_page_may_write_only_its_cache_and_reach_only_private_networks(
     assert set(allowed) - set(private) == {"localhost", "link-local"}
 
 
+@pytest.mark.parametrize("name", [*EVERY, RESTART[1]])
+def test_a_service_may_not_write_below_run(name: str) -> None:
+    """systemd 252 leaves /run writable for a service that gets a /proc of its own."""
+    unit = settings(files()[name])
+    assert unit["ProtectSystem"] == ["strict"]
+    assert unit["ReadOnlyPaths"] == ["/run"]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_statistics_are_readable_by_all_and_the_store_is_private(name: str) -> None:
     """The plain service's folder stays when it ends, because it holds the locks of all."""
