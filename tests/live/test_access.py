@@ -141,6 +141,25 @@ def test_the_token_stays_and_only_its_owner_may_read_it(tmp_path: Path) -> None:
     assert Address.stored(folder, "127.0.0.1", 9000, True).token != first.token
 
 
+def test_the_addresses_of_this_machine_are_found_without_netlink(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The service's sandbox permits no netlink."""
+
+    def refused(*_: object) -> None:
+        raise OSError(97, "Address family not supported by protocol")
+
+    monkeypatch.setattr(socket, "if_nameindex", refused)
+    urls = Address("0.0.0.0", 8044, "", True).urls()
+    assert urls
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        try:
+            sock.connect(("192.0.2.1", 9))  # sends nothing, but chooses this machine's address
+        except OSError:
+            return
+        assert f"http://{sock.getsockname()[0]}:8044/" in urls
+
+
 def test_a_cache_that_cannot_be_used_is_one_clear_line(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("")

@@ -28,7 +28,7 @@ for folder; do
 done
 # Each "systemctl daemon-reload" would run the machine's generators again, a dozen processes that are
 # not needed here.
-for folder in /var/lib /var/log /usr/lib/systemd/system-generators; do mount -t tmpfs tmpfs "$folder"; done
+for folder in /var/lib /var/log /var/cache /usr/lib/systemd/system-generators; do mount -t tmpfs tmpfs "$folder"; done
 mount -t cgroup2 cgroup2 /sys/fs/cgroup
 echo 0123456789abcdef0123456789abcdef >/etc/machine-id
 

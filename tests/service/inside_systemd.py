@@ -14,6 +14,7 @@ import stat
 import subprocess
 import sys
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +27,9 @@ from on_board import LIMIT_S, fresh
 PROGRAM = str(Path(sys.prefix, "bin", "kontronik-can-gw"))
 CONFIGURATION = Path("/etc/kontronik-can-gw/gateway.toml")
 UNIT = "kontronik-can-gw.service"
+WEB = "kontronik-can-gw-web.service"
 RESTART = "kontronik-can-gw-restart@vcan0"
+WEB_CACHE = "/var/cache/kontronik-can-gw-web"
 LINK = "/run/esc"
 LOCKS = "/run/kontronik-can-gw/lock"
 FORBIDDEN = "/dev/not_a_serial_port"
@@ -127,6 +130,7 @@ def trial(facts: Facts) -> None:
         if Path(path).exists()
     }
 
+    facts["web"] = live_page()
     facts["restart"] = interface_restart()
     pid = shown()["MainPID"]
 
@@ -161,19 +165,79 @@ def trial(facts: Facts) -> None:
     # All users may open this device, except the service.
     os.mknod(FORBIDDEN, 0o666 | stat.S_IFCHR, os.makedev(1, 11))
     os.chmod(FORBIDDEN, 0o666)
-    facts["probe"] = probed()
+    facts["probe"] = probed("kontronik-can-gw@probe.service")
+    facts["probe of web"] = probed("kontronik-can-gw-web@probe.service")
     metrics = run("systemctl", "enable", "--now", "kontronik-can-gw-metrics.service")
-    facts["metrics"] = metrics, fetched(), probed()
+    facts["metrics"] = metrics, fetched(), probed("kontronik-can-gw@probe.service")
     facts["log"] = [[entry.get("PRIORITY"), entry.get("MESSAGE")] for entry in entries()]
 
     facts["uninstall"] = service("uninstall")
-    facts["after uninstall"] = [shown(), left_over()]
+    facts["after uninstall"] = [shown(), left_over(), shown(WEB)]
     facts["install again"] = service("install", "--now")
     facts["running in the end"] = shown()
     facts["locks"] = sorted(path.name.partition(".")[2] for path in Path(LOCKS).iterdir())
     run("systemctl", "stop", UNIT)
     facts["locks after a stop"] = [path.name for path in Path(LOCKS).iterdir()]
     facts["end"] = service("uninstall")
+
+
+def live_page() -> Facts:
+    """Serve the page to the network, with the flights of a gateway that records."""
+    run("ip", "link", "set", "lo", "up")
+    write_configuration(CONFIGURATION, "vcan0", LINK, '[record]\ndirectory = "state"\n')
+    found: Facts = {"install": service("install", "--now"), "before": shown(WEB)}
+    until(lambda: "telemetry ok" in shown()["StatusText"])
+    own = Path(f"/run/systemd/system/{WEB}.d/own.conf")
+    own.parent.mkdir()
+    own.write_text("[Service]\nEnvironment=LISTEN=0.0.0.0:8044\n")
+    run("systemctl", "daemon-reload")
+    found["start"] = run("systemctl", "enable", "--now", WEB)
+    found["answered"] = until(lambda: answer("/")[0] > 0)
+    found["page"] = shown(WEB)
+    found["process"] = run("cat", f"/proc/{found['page']['MainPID']}/status")["out"]
+    found["exposure"] = run("systemd-analyze", "security", "--no-pager", WEB)["out"]
+    found["address"] = run(PROGRAM, "web", "--address")
+    token = found["address"]["out"].partition("?token=")[2].partition("\n")[0]
+    found["without token"] = answer("/")
+    found["foreign name"] = answer("/", Host="evil.example")
+    found["with token"], _, cookie = answer(f"/?token={token}")
+    page: dict[str, str] = {"Cookie": cookie.partition(";")[0], "X-Kontronik-Page": "1"}
+
+    def flight() -> Facts:
+        _, body, _ = answer("/flights.json", **page)
+        flights = json.loads(body)["flights"] if body.startswith("{") else []
+        return dict(flights[-1]) if flights else {}
+
+    run("systemctl", "stop", UNIT)  # a capture that is being written has no numbers yet
+    until(lambda: bool(flight().get("summary")))
+    found["flight"] = flight()
+    answer(f"/make/{found['flight'].get('id')}/report", **page)
+    until(lambda: is_made(flight()))
+    found["report"] = answer(f"/flights/{found['flight'].get('id')}/report", **page)[0]
+    found["folders"] = {
+        path: [oct(Path(path).stat().st_mode & 0o777), Path(path).owner()]
+        for path in (WEB_CACHE, f"{WEB_CACHE}/address.json")
+    }
+    found["log"] = run("journalctl", "-u", WEB, "-o", "cat", "--no-pager")["out"]
+    return found
+
+
+def is_made(flight: Facts) -> bool:
+    """Return True if the report of a flight is made or has failed."""
+    state = flight["states"]["report"] if flight else {}
+    return state == "made" or isinstance(state, dict)
+
+
+def answer(path: str, **headers: str) -> tuple[int, str, str]:
+    """Return status, text and cookie of the page's answer. The status is 0 without an answer."""
+    request = urllib.request.Request(f"http://127.0.0.1:8044{path}", headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=20) as done:
+            return done.status, done.read().decode(), done.headers.get("Set-Cookie", "")
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode(), ""
+    except OSError:
+        return 0, "", ""
 
 
 def interface_restart() -> Facts:
@@ -234,9 +298,9 @@ def left_over() -> list[str]:
     return sorted(str(path) for path in found)
 
 
-def probed() -> Facts:
-    """Run the probe as an instance of the template unit, in its sandbox. Return its result."""
-    folder = Path("/run/systemd/system/kontronik-can-gw@probe.service.d")
+def probed(unit: str) -> Facts:
+    """Run the probe as an instance of a template unit, in its sandbox. Return its result."""
+    folder = Path(f"/run/systemd/system/{unit}.d")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "probe.conf").write_text(
         "[Service]\nType=oneshot\nRestart=no\nWatchdogSec=0\nExecStart=\n"
@@ -244,7 +308,7 @@ def probed() -> Facts:
         "StandardOutput=truncate:/run/probe.json\n"
     )
     run("systemctl", "daemon-reload")
-    done = run("systemctl", "start", "kontronik-can-gw@probe.service")
+    done = run("systemctl", "start", unit)
     try:
         found: Facts = json.loads(Path("/run/probe.json").read_text())
     except ValueError:
@@ -260,6 +324,8 @@ def probe() -> None:
         "abstract socket": lambda: socket.socket(socket.AF_UNIX).bind("\0kontronik-can-gw/probe"),
         "state folder": lambda: Path(os.environ["STATE_DIRECTORY"], "x").write_text("x"),
         "runtime folder": lambda: Path(os.environ["RUNTIME_DIRECTORY"], "x").write_text("x"),
+        "cache folder": lambda: Path(os.environ["CACHE_DIRECTORY"], "x").write_text("x"),
+        "run folder": lambda: Path("/run/lock/x").write_text("x"),
         "lock folder": lambda: Path(LOCKS, "x").write_text("x"),
         "other processes": lambda: Path("/proc/1/stat").read_text(),
         "machine-id": lambda: Path("/etc/machine-id").read_text(),

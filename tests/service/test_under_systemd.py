@@ -6,6 +6,7 @@ the facts in a minute or two, and the tests check them.
 
 import json
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -161,10 +162,11 @@ def test_the_sandbox_allows_only_the_needed_actions(facts: Facts) -> None:
     needed = {"CAN socket", "netlink", "abstract socket", "state folder", "runtime folder"}
     needed |= {"lock folder", "terminal", "ctypes", "other processes", "machine-id", "clock state"}
     refused = dict.fromkeys(("internet", "packet"), "Errno 97")
-    refused |= dict.fromkeys(("write /etc", "set kernel"), "Errno 30")
+    refused |= dict.fromkeys(("write /etc", "run folder", "set kernel"), "Errno 30")
     denied = ["write and execute", "another device", "namespace", "priority", "another user"]
     denied += ["set clock", "adjust clock"]
     refused |= dict.fromkeys(denied, "Errno 1]")
+    refused["cache folder"] = "KeyError"
     probe = facts["probe"]
     assert set(probe) == {*needed, *refused}
     assert [name for name in needed if probe[name] != "works"] == []
@@ -206,6 +208,44 @@ def test_metrics_are_served_and_the_gateway_still_cannot_use_ip(facts: Facts) ->
     assert done["code"] == 0
     assert "kontronik_gateway_escs 1.0" in text
     assert probe == facts["probe"]
+
+
+def test_the_live_page_runs_and_asks_for_its_token(facts: Facts) -> None:
+    found = facts["web"]
+    assert found["before"]["UnitFileState"] == "disabled"
+    assert (found["start"]["code"], found["page"]["ActiveState"]) == (0, "active")
+    assert found["address"]["code"] == 0
+    status, text, _ = found["without token"]
+    assert status == 403
+    assert "esc1" not in text
+    assert found["foreign name"][0] == 421
+    assert found["with token"] == 200
+    assert "token=" not in found["log"]
+    assert found["folders"] == {
+        "/var/cache/kontronik-can-gw-web": ["0o700", "kontronik-can-gw"],
+        "/var/cache/kontronik-can-gw-web/address.json": ["0o600", "kontronik-can-gw"],
+    }
+    assert facts["after uninstall"][2]["ActiveState"] == "inactive"
+
+
+def test_the_live_page_makes_a_report_in_its_sandbox(facts: Facts) -> None:
+    assert facts["web"]["flight"]["summary"]["voltage"] > 10
+    assert facts["web"]["report"] == 200
+
+
+def test_the_live_page_may_write_only_its_cache(facts: Facts) -> None:
+    process = dict(
+        line.split(":\t", 1) for line in facts["web"]["process"].splitlines() if ":\t" in line
+    )
+    assert "0" not in process["Uid"].split() + process["Gid"].split()
+    assert {process[f"Cap{kind}"] for kind in ("Inh", "Prm", "Eff", "Bnd", "Amb")} == {"0" * 16}
+    exposure = re.search(r"exposure level for \S+: ([\d.]+)", facts["web"]["exposure"])
+    assert exposure
+    assert float(exposure[1]) <= 1.6
+    probe = facts["probe of web"]
+    works = {name for name, result in probe.items() if result == "works"}
+    needed = {"CAN socket", "internet", "abstract socket", "cache folder", "ctypes", "machine-id"}
+    assert works == {*needed, "terminal", "priority"}, probe
 
 
 def test_uninstall_keeps_configuration_and_state(facts: Facts) -> None:
