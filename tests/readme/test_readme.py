@@ -83,6 +83,15 @@ def test_json_blocks_are_valid() -> None:
         json.loads(block.text)
 
 
+def test_each_fault_has_the_place_that_reports_it() -> None:
+    text = PAGES[PROJECT / "docs/faults.md"].partition("\n## Proof")[0]
+    sections = re.split(r"^### ", text, flags=re.MULTILINE)[1:]
+    assert len(sections) > 20
+    for section in sections:
+        title, _, rest = section.partition("\n")
+        assert "*Reported as:*" in rest, title
+
+
 def test_every_command_is_documented() -> None:
     assert all(f"`kontronik-can-gw {command}" in README for command in COMMANDS)
 
