@@ -103,7 +103,8 @@ def main(args: argparse.Namespace) -> int:
         sock = server.listen(host, port)
         cache = access.cache_folder(args.cache)
         address = access.Address.stored(cache, host, sock.getsockname()[1], is_open)
-        flights = Flights(*_captures_of(args, source), cache)
+        captures, min_free_mb = _captures_of(args, source)
+        flights = Flights(captures, min_free_mb, cache)
         hub = server.Hub(Content(source, flights.disk))
         page = server.LiveServer(hub, sock, None if is_open else address.token, flights)
 
@@ -116,6 +117,8 @@ def main(args: argparse.Namespace) -> int:
         thread = threading.Thread(target=feed, daemon=True)
         with stopping_on_signals(page.stop):
             _announce(source, address)
+            if captures is not None and (problem := flights.scan()):
+                say(f"warning: {problem}")
             thread.start()
             page.serve()
         stopped.set()
@@ -172,9 +175,7 @@ def _print_code(address: "Address", stream: TextIO) -> None:
 
 def _captures_of(args: argparse.Namespace, source: Source) -> tuple[Path | None, int]:
     """Return the folder of captures, or None, and the MB that a recorder leaves free."""
-    config = None if source.is_file else source.bus.config
-    record = RecordConfig() if config is None else config.record
-    folder = args.captures
-    if folder is None and config is not None:
-        folder = record_folder(config)
-    return folder, record.min_free_mb
+    config = source.bus.config
+    if source.is_file or config is None:
+        return args.captures, RecordConfig().min_free_mb
+    return record_folder(config, args.captures), config.record.min_free_mb

@@ -49,6 +49,17 @@ def test_mistakes_are_one_clear_line(tmp_path: Path, log: Path) -> None:
         assert "is not an address and port" in run("web", "--listen", text).err
 
 
+def test_captures_that_cannot_be_read_are_told_at_the_start(tmp_path: Path, log: Path) -> None:
+    words = ["web", str(log), "--listen", "127.0.0.1:0", "--cache", str(tmp_path)]
+    words += ["--captures", str(tmp_path / "nowhere")]
+    served = LoggedProcess([*map(str, PROGRAM), *words])
+    wait_until(lambda: "nowhere" in served.log, "the warning")
+    served.process.terminate()
+    assert served.wait() == 0
+    (warning,) = [line for line in served.log.splitlines() if "warning" in line]
+    assert warning.endswith("/nowhere: cannot be read: No such file or directory.")
+
+
 @pytest.mark.parametrize("options", [(), ("--no-token",)])
 def test_a_log_never_contains_the_token(
     tmp_path: Path, log: Path, options: tuple[str, ...]
