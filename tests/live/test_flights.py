@@ -106,7 +106,7 @@ def test_the_report_equals_that_of_the_command_and_is_kept(
     source = folder / "20260101T100000Z-aaaaaa-00000.kcap"
     assert run("report", source, "-o", output).code == 0
     assert body == output.read_bytes()
-    kept = {file: file.stat().st_mtime_ns for file in (tmp_path / "cache/flights").glob("*.html")}
+    kept = {file: file.stat().st_mtime_ns for file in (tmp_path / "cache/flights").glob("*.report")}
     made(page, 1, "report")
     assert kept == {file: file.stat().st_mtime_ns for file in kept}
     with source.open("ab") as file:

@@ -142,14 +142,11 @@ def cache_folder(given: Path | None) -> Path:
 
     It is ``given``, the folder that systemd provides, or one in the user's cache folder.
     """
-    provided = os.environ.get("CACHE_DIRECTORY")
-    folder = given
-    if folder is None and provided:
-        folder = Path(provided)
+    caches = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    provided = os.environ.get("CACHE_DIRECTORY") or f"{caches}/kontronik-can-gw"
+    folder = given or Path(provided)
     try:
-        if folder is None:
-            caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-            folder = Path(caches) / "kontronik-can-gw"
+        folder = folder.expanduser()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(0, "no permission to write")

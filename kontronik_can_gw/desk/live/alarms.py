@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Container, Iterable
 from dataclasses import asdict
+from operator import itemgetter
 from typing import Any
 
 from kontronik_can_gw.desk.member import Alarm
@@ -25,47 +26,51 @@ class AlarmLog:
 
     def __init__(self) -> None:
         self._open: dict[tuple[int, str], FlightEvent] = {}
-        """The present alarms by ESC and name."""
-        self._missing: dict[tuple[int, str], int] = {}
-        """Since when a present alarm was no longer reported."""
+        """The present alarms by ESC and name. Their end is the time of the first missing report."""
         self._ended: deque[FlightEvent] = deque(maxlen=_KEPT)
 
     def update(self, esc: int, alarms: Iterable[Alarm], known: Container[str], now: int) -> None:
         """Set the present alarms of an ESC. ``known``: names whose state is known."""
-        present = {(esc, alarm.text): alarm for alarm in alarms}
-        for key in [key for key in self._open if key[0] == esc]:
-            if key in present:
-                self._missing.pop(key, None)
-                continue
-            since = self._missing.setdefault(key, now)
-            if now - since < _CONFIRMED_NS:
-                continue
-            event = self._open.pop(key)
-            event.end_ns = self._missing.pop(key)
-            if key[1] not in known:
-                event.note = _LOST
-            self._ended.append(event)
-        for key, alarm in present.items():
-            if key not in self._open:
+        reported = set()
+        for alarm in alarms:
+            key = esc, alarm.text
+            reported.add(key)
+            event = self._open.get(key)
+            if event is None:
                 kind: EventKind = "link" if alarm.text == "link" else "error"
-                self._open[key] = FlightEvent(
-                    kind, esc, now, "", alarm.severity.value, alarm.remedy
+                event = FlightEvent(
+                    kind=kind,
+                    esc=esc,
+                    begin_ns=now,
+                    text="",
+                    severity=alarm.severity.value,
+                    remedy=alarm.remedy,
                 )
-            self._open[key].text = alarm.meaning  # it may contain a duration
+                self._open[key] = event
+            event.text = alarm.meaning  # it may contain a duration
+            event.end_ns = None
+        for key, event in list(self._open.items()):
+            if event.esc != esc or key in reported:
+                continue
+            if event.end_ns is None:
+                event.end_ns = now
+            if now - event.end_ns >= _CONFIRMED_NS:
+                if key[1] not in known:
+                    event.note = _LOST
+                self._ended.append(event)
+                del self._open[key]
 
     def document(self, now: int) -> list[dict[str, Any]]:
         """Return all alarms, newest first. ``from`` and ``to`` are seconds before ``now``."""
-        events = sorted(
-            [*self._open.values(), *self._ended], key=lambda event: event.begin_ns, reverse=True
-        )
         found = []
-        for event in events:
-            content = asdict(event)
-            content["from"] = _seconds(event.begin_ns - now)
-            content["to"] = None if event.end_ns is None else _seconds(event.end_ns - now)
-            found.append(content)
-        return found
+        for event in self._open.values():
+            found.append(asdict(event) | {"to": None})
+        for event in self._ended:
+            found.append(asdict(event) | {"to": _seconds(event.end_ns or 0, now)})
+        for content in found:
+            content["from"] = _seconds(content["begin_ns"], now)
+        return sorted(found, key=itemgetter("begin_ns"), reverse=True)
 
 
-def _seconds(time_ns: int) -> float:
-    return round(time_ns / SECOND, 1)
+def _seconds(time_ns: int, now: int) -> float:
+    return round((time_ns - now) / SECOND, 1)

@@ -30,7 +30,6 @@ from kontronik_can_gw.capture.format import SUFFIX
 from kontronik_can_gw.desk.live.access import is_command
 from kontronik_can_gw.desk.report.page import policy
 from kontronik_can_gw.runtime.files.disk import is_locked
-from kontronik_can_gw.times import SECOND
 
 _PACKAGE = "kontronik_can_gw"
 _SUMMARY = "summary"
@@ -41,7 +40,6 @@ _COMMANDS = {
     "parquet": (_PACKAGE, "convert", "{source}", "{output}", "--force"),
 }
 """Module and arguments of the child process for each kind of file."""
-_ENDINGS = {_SUMMARY: "json", "report": "html", "csv": "csv", "parquet": "parquet"}
 _PART = re.compile(r"(.+)-[0-9]+$")
 """Name of a part of a run without its suffix."""
 _LIMIT_S = 1800
@@ -53,8 +51,6 @@ _CACHE_BYTES = 512 << 20
 _POLL_S = 0.5
 _LOOKED_AT_S = 10.0
 """Summaries are made until this time after the last request for the list."""
-_WRITTEN_S = 300
-"""A capture that was not changed for this time is not being written."""
 _NICE = 19
 _OOM_ADJUSTMENT = "900"
 
@@ -74,8 +70,7 @@ class Recording(NamedTuple):
     @property
     def is_written(self) -> bool:
         """True while a gateway writes the last capture."""
-        is_new = time.time() - self.changed_ns / SECOND < _WRITTEN_S
-        return is_new and is_locked(self.paths[-1])
+        return is_locked(self.paths[-1])
 
     @property
     def key(self) -> str:
@@ -180,7 +175,7 @@ class Flights:
             raise HTTPException(404)
         if kind == "report":
             headers = {"Content-Security-Policy": f"{policy()}; frame-ancestors 'none'"}
-            return FileResponse(path, headers=headers)
+            return FileResponse(path, headers=headers, media_type="text/html")
         return FileResponse(path, filename=f"{recording.name}{path.suffix}")
 
     async def _capture(self, request: Request) -> Response:
@@ -193,7 +188,7 @@ class Flights:
 
     # --- list
 
-    def _scan(self) -> str:
+    def scan(self) -> str:
         """Read the folder. Return a line about its fault, or ""."""
         if self._folder is None:
             return (
@@ -210,7 +205,7 @@ class Flights:
 
     def _content(self) -> dict[str, Any]:
         """Read the folder. Return the list of flights."""
-        problem = self._scan()
+        problem = self.scan()
         kinds = [kind for kind in _COMMANDS if kind != _SUMMARY]
         if importlib.util.find_spec("pyarrow") is None:
             kinds.remove("parquet")
@@ -248,7 +243,7 @@ class Flights:
         return None
 
     def _made(self, recording: Recording, kind: str) -> Path:
-        return self._cache / f"{recording.key}.{_ENDINGS[kind]}"
+        return self._cache / f"{recording.key}.{kind}"
 
     # --- worker
 
@@ -322,20 +317,16 @@ class Flights:
     def _prune(self) -> None:
         """Remove files of changed and removed captures, and the oldest if there are too many."""
         keys = {recording.key for recording in self._recordings.values()}
-        left = []
+        total = 0
         with contextlib.suppress(OSError):
-            for path in self._cache.iterdir():
-                status = path.stat()
-                if self._recordings and path.name.partition(".")[0] not in keys:
-                    path.unlink()
+            newest = sorted(self._cache.iterdir(), key=os.path.getmtime, reverse=True)
+            for path in newest:
+                size = path.stat().st_size
+                is_current = path.stem in keys or not keys
+                if is_current and total + size <= _CACHE_BYTES:
+                    total += size
                 else:
-                    left.append((status.st_mtime_ns, status.st_size, path))
-            total = sum(size for _, size, _ in left)
-            for _, size, path in sorted(left):
-                if total <= _CACHE_BYTES:
-                    break
-                path.unlink()
-                total -= size
+                    path.unlink()
 
     def disk(self) -> str:
         """Return a line about the disk of the captures if its space is short, or ""."""

@@ -8,14 +8,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.recorded import flight_of
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.times import MS, SECOND
 
-_CLOCK_IS_SET_MS = 1_577_836_800_000
+_CLOCK_IS_SET_NS = 1_577_836_800 * SECOND
 """2020-01-01. An earlier date comes from a clock that was not set."""
 
 
@@ -25,15 +25,10 @@ def summary_of(capture: Path) -> dict[str, Any]:
         flight = flight_of(recording)
         if not flight.rows:
             raise RunError(*recording.damage, f"{capture.name}: has no values")
-        wall_ns = recording.wall_ns(flight.origin_ns)
-        is_trusted = recording.trust.at(flight.origin_ns)
-        start_ms = None if wall_ns is None else wall_ns // MS
-        if start_ms is not None and (is_trusted is False or start_ms < _CLOCK_IS_SET_MS):
-            start_ms = None
         energies = [esc.energy_wh for esc in flight.escs if esc.energy_wh is not None]
         severities = [event.severity for event in flight.events]
         return {
-            "start": start_ms,
+            "start": _start_ms(recording, flight.origin_ns),
             "duration": round((flight.end_ns - flight.start_ns) / SECOND, 1),
             "current": max(_extremes(flight, "battery_current"), default=None),
             "voltage": min(_extremes(flight, "battery_voltage"), default=None),
@@ -42,6 +37,14 @@ def summary_of(capture: Path) -> dict[str, Any]:
             "warnings": severities.count("warning"),
             "damage": len(recording.damage),
         }
+
+
+def _start_ms(recording: Input, origin_ns: int) -> int | None:
+    """Return the Unix time of the begin. None if the clock was not set."""
+    wall_ns = recording.wall_ns(origin_ns)
+    if wall_ns is None or wall_ns < _CLOCK_IS_SET_NS or recording.trust.at(origin_ns) is False:
+        return None
+    return wall_ns // MS
 
 
 def _extremes(flight: Flight, source: str) -> list[float]:
