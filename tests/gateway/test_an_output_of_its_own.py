@@ -1,23 +1,24 @@
-"""The recipe for another output: one class, and one line in the gateway's tuple.
+"""An output that follows the recipe of docs/design.md, and the calls of a NodeOutput.
 
-The output of this test sends an invented frame for each ESC once a second.
+The output is in outputs/voltages. test_every_output.py tests it like the outputs of the package.
 """
 
 from pathlib import Path
 
+import example_output
 import pytest
+from example_output import FIRST_ID
 
 from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.config.parse import parse
-from kontronik_can_gw.core.output import NO_IDS, NodeOutput, NodeState, Output, OutputHost, Owner
+from kontronik_can_gw.core.output import NO_IDS, NodeOutput, NodeState, Output
 from kontronik_can_gw.core.output_setup import ReadyOutput
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik import codec
 from kontronik_can_gw.esc.kontronik.codec import encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
-from kontronik_can_gw.esc.telemetry import EscSettings, Event
-from kontronik_can_gw.esc.values import VALUES, steps
+from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.system.locks import names_of
@@ -27,58 +28,22 @@ from kontronik_can_gw.times import SECOND
 
 pytestmark = pytest.mark.promise("outputs")
 
-FIRST_ID = 0x1234500
 COMMAND_ID = 0x12
 ESCS = [EscSettings("left"), EscSettings("right")]
 
 
-class Voltages(Output):
-    """An output that sends each ESC's battery voltage in 10 mV, or FFFFh if not available.
-
-    A CAN command changes the period.
-    """
-
-    def __init__(self, host: OutputHost, now: int) -> None:
-        super().__init__()
-        self.receive_ids = frozenset({COMMAND_ID})
-        self._escs = host.escs
-        self._gateway = host.status
-        self._due = now + SECOND
-        self._period = SECOND
-
-    def own_ids(self) -> dict[int, Owner]:
-        return {FIRST_ID + n | EXTENDED: Owner(n, "voltage") for n in range(len(self._escs))}
-
-    def next_deadline(self) -> int:
-        return self._due
-
-    def on_event(self, esc: int, events: int, now: int) -> None:
-        if events & Event.LINK and not self._escs[esc].up:
-            self._send(esc, now)
-
-    def receive(self, frame: CanFrame, now: int, at: int) -> None:
-        if frame.can_id == COMMAND_ID:
-            self._period = frame.data[0] * SECOND
-
-    def advance(self, now: int) -> None:
-        if now >= self._due:
-            self._due += self._period
-            for esc in range(len(self._escs)):
-                self._send(esc, now)
-
-    def _send(self, esc: int, now: int) -> None:
-        value = steps(VALUES["battery_voltage"], self._escs[esc], self._gateway, now)
-        data = (0xFFFF if value is None else value).to_bytes(2, "little")
-        self.frames.append(CanFrame(FIRST_ID + esc, data, extended=True))
-
-
-class VoltagesMaker:
-    """Makes the output. It needs no slots."""
-
-    slots = 0
-
-    def make(self, host: OutputHost, now: int) -> Voltages:
-        return Voltages(host, now)
+@pytest.fixture
+def gateway(monkeypatch: pytest.MonkeyPatch) -> Gateway:
+    """Return a gateway with two ESCs that has the output of outputs/voltages alone."""
+    example_output.add_to_package(monkeypatch)
+    tables = {
+        "can": {"interface": "virtual"},
+        "dbc": {"enabled": False},
+        "voltages": {"enabled": True},
+        "esc": [{"port": esc.name, "name": esc.name} for esc in ESCS],
+    }
+    loaded = assemble(parse(tables, "test"))
+    return Gateway(loaded.core_settings, 0, outputs=loaded.outputs)
 
 
 def test_other_receive_ids_increase_the_revision_even_if_they_are_equal() -> None:
@@ -140,8 +105,7 @@ def test_node_output_stores_parameters_and_plain_output_is_not_asked() -> None:
     assert names_of(gateway, "can0") == ["can0: memory node 5"]
 
 
-def test_a_further_output_sends_values_and_receives_commands() -> None:
-    gateway = Gateway(CoreSettings(ESCS, Layout("", "", ())), 0, outputs=[VoltagesMaker()])
+def test_a_further_output_sends_values_and_receives_commands(gateway: Gateway) -> None:
     gateway.start(0)
     found = []
     for now in range(0, 4 * SECOND, SECOND // 10):
@@ -166,8 +130,7 @@ def test_a_further_output_sends_values_and_receives_commands() -> None:
     assert sent_for_left == [(second * SECOND, 0, "ffff") for second in (1, 2, 3)]
 
 
-def test_another_device_with_ids_of_a_further_output_is_noticed() -> None:
-    gateway = Gateway(CoreSettings(ESCS, Layout("", "", ())), 0, outputs=[VoltagesMaker()])
+def test_another_device_with_ids_of_a_further_output_is_noticed(gateway: Gateway) -> None:
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
     (conflict,) = gateway.conflicts.take()
