@@ -140,8 +140,13 @@ def _can_id_as_data_id(copy: Copy) -> tuple[int, ...]:
     return (copy.frame_id & 0xFFFF,)
 
 
-def _data_id_warnings(job: Compilation, copy: Copy, sent: Protection) -> Iterator[str]:
-    """Yield a warning if the DBC states a data ID that is not used, or one of an unusual name."""
+def _data_id_warnings(
+    job: Compilation, copy: Copy, sent: Protection, *, has_warned: bool
+) -> Iterator[str]:
+    """Yield a warning if the DBC states a data ID that is not used, or one of an unusual name.
+
+    An earlier warning (``has_warned``) already asks to confirm the data ID that is sent.
+    """
     if copy.name in job.settings.e2e_data_ids:
         return
     where = f"{job.file}: {copy.message.name}"
@@ -160,7 +165,7 @@ def _data_id_warnings(job: Compilation, copy: Copy, sent: Protection) -> Iterato
     used = ", ".join(f"0x{data_id:X}" for data_id in sent.data_ids)
     value = used if len(sent.data_ids) == 1 else f"[{used}]"
     if stated == sent.data_ids:
-        if name != "E2EDataId":
+        if name != "E2EDataId" and not has_warned:
             yield (
                 f"{where}: sent with the data ID of the attribute {name}, {text[:80]}. "
                 f"To confirm this, set {key} = {value}"
@@ -249,6 +254,7 @@ def message_protection(
     job.protected.update(keys_of(copy, tuple(job.settings.e2e)))
     (crc,) = crcs
     found = stated
+    warnings_before = len(job.warnings)
     if found is None:
         found = _assumed(job, copy, crc, alive)
     if found is None:
@@ -261,7 +267,8 @@ def message_protection(
         )
         return None
     job.problems += _fit_problems(found.profile, crc, alive, signals, where)
-    job.warnings += _data_id_warnings(job, copy, found)
+    has_warned = len(job.warnings) > warnings_before
+    job.warnings += _data_id_warnings(job, copy, found, has_warned=has_warned)
     length = copy.message.length
     if length > found.profile.max_bytes:
         job.warnings.append(

@@ -705,6 +705,12 @@ def test_a_profile_that_is_stated_as_none_is_named_in_the_warning() -> None:
     assert "sent as AUTOSAR E2E profile 1, although its E2EProfile is 'none'" in line
 
 
+def test_an_assumed_profile_and_a_data_id_of_an_unusual_name_cause_one_warning() -> None:
+    text = layout_text("1A").replace("M_BZ", "M_Alive") + attributes("none", 7)
+    (line,) = e2e_warnings(compiled(text.replace("E2EDataId", "DataID")))
+    assert line.endswith("To confirm this, set dbc.e2e_data_ids.M = 0x7")
+
+
 @pytest.mark.parametrize("name", ["1B", "1C", "2", "5"])
 def test_a_message_that_lacks_only_its_data_id_gets_one_line(name: str) -> None:
     (line,) = refused(layout_text(name), e2e={"M": name})
