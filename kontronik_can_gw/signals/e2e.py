@@ -118,7 +118,7 @@ class Protection:
     def __str__(self) -> str:
         digits = 2 if self.profile.ids > 1 else 4
         ids = " ".join(f"{data_id:0{digits}X}" for data_id in self.data_ids)
-        noun = "data id" if len(self.data_ids) == 1 else "data ids"
+        noun = "data ID" if len(self.data_ids) == 1 else "data IDs"
         return f"AUTOSAR E2E profile {self.profile.name}, {noun} {ids}h"
 
     @property
