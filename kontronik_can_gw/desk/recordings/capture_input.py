@@ -50,6 +50,10 @@ After one of these, it is certain that the frames of the previous turn were sent
 """
 _LOOK_FOR_HEADER = 1 << 25
 """Number of bytes of a part in which the header is looked for."""
+_NO_HEADER = (
+    "has no readable header, so its content cannot be interpreted. "
+    "Convert another part of this run, or the whole folder."
+)
 _MAX_EVENTS = 10
 """Number of events that are listed."""
 _MAX_DAMAGE = 50
@@ -280,9 +284,7 @@ class CaptureInput(PlayedInput):
                         return read_json(found.payload)
             self.close()
             if len(self._paths) == 1:
-                raise UserError(
-                    f"{path}: has no readable header, so its content cannot be interpreted"
-                )
+                raise UserError(f"{path}: {_NO_HEADER}")
             self._headerless.append(f"{path.name}: left out, because it has no readable header")
             del self._paths[0]
 
