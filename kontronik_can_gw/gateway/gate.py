@@ -12,15 +12,15 @@ The states and events are the table ``TABLE`` of gate_table.py. docs/design.md s
 """
 
 from kontronik_can_gw.gateway.gate_rules import CHANGES, TESTS
-from kontronik_can_gw.gateway.gate_state import GateState
+from kontronik_can_gw.gateway.gate_state import GateState, Limit
 from kontronik_can_gw.gateway.gate_table import (
     ANSWER_NS,
     HELD,
     LASTING_NS,
     NO_PORT,
+    NOT_SLOW,
     SOON_NS,
     TABLE,
-    UNLIMITED,
     Event,
     Row,
     State,
@@ -69,9 +69,6 @@ class Gate(GateState):
     def lost(self, is_down: bool, now: int) -> None:
         """Follow an interface that was set down, was removed or cannot be opened."""
         self.is_off = False
-        self.limit.takes_long = False
-        self.is_slow = False
-        self.limit.frames = UNLIMITED
         self._forget()
         if not is_down or now - self.restart.asked > ANSWER_NS:
             self.restart.is_awaited = False
@@ -242,6 +239,11 @@ class Gate(GateState):
         """Prepare for a state that was just entered."""
         if state in HELD:
             self.retry_due = NEVER
+        if state in NOT_SLOW:
+            self.limit = Limit()
+            self.is_slow = False
+        if self.is_quiet:
+            self.is_stalled = False  # nobody listens on the bus of a parked vehicle
         if state is State.BLOCKED:
             self.first.at = None
             self.first.moves_since = None

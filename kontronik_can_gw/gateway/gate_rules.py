@@ -30,6 +30,11 @@ def _hold(gate: GateState, now: int) -> None:
     gate.discarded = now
 
 
+def _forget(gate: GateState, _now: int) -> None:
+    gate.under_way.forget()
+    gate.still_since = NEVER
+
+
 def _release(gate: GateState, now: int) -> None:
     gate.is_held = False
     gate.restart.works_since = now
@@ -43,7 +48,7 @@ def _release(gate: GateState, now: int) -> None:
 
 def _limit(gate: GateState, now: int) -> None:
     gate.limit.since = now
-    gate.limit.frames = min(gate.limit.frames, gate.under_way.frames)
+    gate.limit.frames = gate.under_way.frames
     _halve(gate, now)
 
 
@@ -56,12 +61,6 @@ def _halve(gate: GateState, now: int) -> None:
 def _grow(gate: GateState, now: int) -> None:
     gate.limit.frames += 1
     gate.limit.quarter_due = now + gate.quarter_ns
-
-
-def _unlimit(gate: GateState, _now: int) -> None:
-    gate.limit.frames = UNLIMITED
-    gate.limit.takes_long = False
-    gate.is_slow = False
 
 
 def _ask(gate: GateState, now: int) -> None:
@@ -110,12 +109,24 @@ def _is_blocked(gate: GateState, now: int) -> bool:
     return now - gate.still_since >= limit
 
 
+def _is_opened_without_first(gate: GateState, now: int) -> bool:
+    if not gate.under_way.frames:
+        return True
+    return not gate.queued and now - gate.outage_since >= NO_FIRST_NS
+
+
 def _is_quarter_over(gate: GateState, now: int) -> bool:
     return now >= gate.limit.quarter_due
 
 
 def _is_refused_long(gate: GateState, now: int) -> bool:
     return gate.refused_since is not None and now - gate.refused_since >= LASTING_NS
+
+
+def _is_stall_noticed(gate: GateState, now: int) -> bool:
+    if gate.is_stalled or gate.is_off or gate.is_quiet:
+        return False
+    return now - gate.outage_since >= LASTING_NS
 
 
 def _has_first_left(gate: GateState, now: int) -> bool:
@@ -168,6 +179,7 @@ TESTS: Mapping[If, Callable[[GateState, int], bool]] = {
     If.ALWAYS: lambda _gate, _now: True,
     If.NEVER_HELD: lambda gate, _now: not gate.is_held,
     If.QUIET: lambda gate, _now: gate.is_quiet,
+    If.QUIET_ON: lambda gate, _now: gate.is_quiet and not gate.is_off,
     If.RESTART: lambda gate, _now: gate.restart.is_awaited,
     If.FAILED: lambda gate, now: not gate.is_socket and _is_refused_long(gate, now),
     If.REFUSED_LONG: _is_refused_long,
@@ -182,18 +194,15 @@ TESTS: Mapping[If, Callable[[GateState, int], bool]] = {
         not gate.is_slow and gate.limit.late - gate.limit.since >= LASTING_NS
     ),
     If.UNCOUNTED: lambda gate, _now: not gate.under_way.count,
-    If.NONE_UNDER_WAY: lambda gate, _now: not gate.under_way.frames,
+    If.NO_FIRST_OPENS: _is_opened_without_first,
     If.NO_FIRST: lambda gate, _now: gate.first.is_missing,
-    If.NO_FIRST_LONG: lambda gate, now: now - gate.outage_since >= NO_FIRST_NS,
     If.FIRST_LEFT: _has_first_left,
     If.FIRST_LEFT_SLOWLY: _has_first_left_slowly,
     If.BUS_IS_ON: lambda gate, _now: not gate.is_off,
     If.FIRST_SENT: lambda gate, _now: gate.first.at is not None,
     If.STANDS: lambda gate, now: now - gate.outage_since >= LASTING_NS,
     If.REPEAT: _is_first_lost,
-    If.STALLED: lambda gate, now: (
-        not gate.is_stalled and not gate.is_off and now - gate.outage_since >= LASTING_NS
-    ),
+    If.STALLED: _is_stall_noticed,
     If.DISCARD: lambda gate, now: now - gate.discarded >= LASTING_NS,
     If.HELD_FRAMES: lambda gate, now: now > gate.discarded,
     If.ASK: _may_ask_now,
@@ -209,11 +218,11 @@ TESTS: Mapping[If, Callable[[GateState, int], bool]] = {
 
 CHANGES: Mapping[Act, Callable[[GateState, int], None]] = {
     Act.HOLD: _hold,
+    Act.FORGET: _forget,
     Act.RELEASE: _release,
     Act.LIMIT: _limit,
     Act.HALVE: _halve,
     Act.GROW: _grow,
-    Act.UNLIMIT: _unlimit,
     Act.ASK: _ask,
     Act.COUNT: _count_restart,
     Act.NOT_RESTARTED: _note_unanswered,

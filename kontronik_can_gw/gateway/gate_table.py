@@ -18,7 +18,7 @@ WORKED_NS = 2 * SECOND
 MAX_PAUSE_NS = 10 * SECOND
 """Longest pause between two requests of a restart."""
 NO_FIRST_NS = 10 * SECOND
-"""Longest wait for frames under way if no first frame exists."""
+"""Longest wait for a departure if no first frame exists. Then one frame is tried."""
 UNLIMITED = 32
 """More frames than kernel, driver and controller hold: a limit that limits nothing."""
 
@@ -72,6 +72,7 @@ class If(Enum):
     ALWAYS = ""
     NEVER_HELD = "frames were never held"
     QUIET = "quiet mode"
+    QUIET_ON = "quiet mode, no bus-off"
     RESTART = "down within 2 s after a request"
     FAILED = "refused for 1 s, no socket"
     REFUSED_LONG = "refused for 1 s"
@@ -82,16 +83,15 @@ class If(Enum):
     QUARTER = "quarter over"
     LATE_LONG = "late frames for 1 s, not reported"
     UNCOUNTED = "the driver does not count"
-    NONE_UNDER_WAY = "no frame is under way"
+    NO_FIRST_OPENS = "no frame is under way, or none has left for 10 s"
     NO_FIRST = "no first frame exists"
-    NO_FIRST_LONG = "no first frame exists, for 10 s"
     FIRST_LEFT = "the first frame has left"
     FIRST_LEFT_SLOWLY = "it has left, after a quarter or on a slow bus"
     BUS_IS_ON = "no bus-off"
     FIRST_SENT = "a first frame was accepted"
     STANDS = "none has left for 1 s"
     REPEAT = "1 s, not in the kernel's queue"
-    STALLED = "none has left for 1 s, not reported"
+    STALLED = "none has left for 1 s, not reported, no quiet mode"
     DISCARD = "1 s since the last time"
     HELD_FRAMES = "at each iteration"
     ASK = "pause over"
@@ -109,6 +109,7 @@ class Act(Enum):
     """Work for the owner of the gate."""
 
     HOLD = "hold frames, discard waiting ones"
+    FORGET = "forget frames under way"
     RELEASE = "send everything again"
     PROVE = "end the fault of the interface"
     LIMIT = "limit frames under way"
@@ -144,6 +145,8 @@ NO_PORT = (_S.CLOSED, _S.OPENING, _S.LOST, _S.BUS_OFF, _S.SETTLING)
 """States in which nothing can be handed over."""
 PASSING = (_S.UNPROVEN, _S.OPEN, _S.SLOW, _S.QUIET)
 """States in which frames pass."""
+NOT_SLOW = (_S.OPEN, _S.LOST, _S.QUIET, _S.QUIET_BLOCKED)
+"""States in which a limit and a report of a slow bus end."""
 _WAITING = (_S.BLOCKED, _S.FIRST, _S.MOVING, _S.RESTARTING)
 _SHUT = (_S.CLOSED, _S.OPENING, _S.LOST)
 HELD = (*NO_PORT, *_WAITING, _S.QUIET_BLOCKED)
@@ -182,19 +185,11 @@ TABLE = (
     Row(
         (_S.BLOCKED,),
         _E.NO_FIRST,
-        If.NONE_UNDER_WAY,
+        If.NO_FIRST_OPENS,
         _S.SLOW,
-        (Act.RELEASE, Act.PROVE, Act.LIMIT),
-    ),
-    Row(
-        (_S.BLOCKED,),
-        _E.NO_FIRST,
-        If.NO_FIRST_LONG,
-        _S.SLOW,
-        (Act.RELEASE, Act.PROVE, Act.LIMIT),
+        (Act.FORGET, Act.RELEASE, Act.PROVE, Act.LIMIT),
     ),
     Row((_S.BLOCKED,), _E.MOVED, If.NO_FIRST, _S.SLOW, (Act.RELEASE, Act.PROVE, Act.LIMIT)),
-    Row((_S.BLOCKED,), _E.REQUEST, If.NO_FIRST, _S.SLOW, (Act.RELEASE, Act.PROVE, Act.LIMIT)),
     Row(
         (_S.FIRST, _S.MOVING),
         _E.MOVED,
@@ -236,7 +231,7 @@ TABLE = (
     Row((_S.QUIET,), _E.STILL, If.BLOCKED, _S.QUIET_BLOCKED, (Act.HOLD,)),
     Row((_S.QUIET_BLOCKED,), _E.MOVED, If.ALWAYS, _S.QUIET, (Act.RELEASE, Act.PROVE)),
     Row((_S.QUIET_BLOCKED,), _E.REQUEST, If.ALWAYS, _S.QUIET, (Act.RELEASE, Act.PROVE)),
-    Row((_S.RESTARTING,), _E.REQUEST, If.QUIET, _S.QUIET, (Act.RELEASE, Act.PROVE)),
+    Row((_S.RESTARTING,), _E.REQUEST, If.QUIET_ON, _S.QUIET, (Act.RELEASE, Act.PROVE)),
     Row((_S.RESTARTING,), _E.QUIET_ENDS, If.BUS_IS_ON, _S.BLOCKED, (Act.HOLD,)),
     Row((_S.QUIET, _S.QUIET_BLOCKED), _E.QUIET_ENDS, If.ALWAYS, _S.BLOCKED, (Act.HOLD,)),
     # the process

@@ -33,10 +33,16 @@ class GateReports:
         gate = self._gate
         if not gate.is_slow and self._conditions.is_on(self.slow):
             text = f"CAN {self._channel}: the bus takes all frames in time"
-            self._conditions.end(self.slow, text, now)
+            self._end(self.slow, text, now)
         if not gate.is_stalled and self._conditions.is_on(self.stalled):
-            text = f"CAN {self._channel}: frames are sent again"
-            self._conditions.end(self.stalled, text, now)
+            self._end(self.stalled, f"CAN {self._channel}: frames are sent again", now)
+
+    def _end(self, name: str, text: str, now: int) -> None:
+        """End a fault. If quiet mode ended it, ``text`` would not be true."""
+        if self._gate.is_quiet:
+            self._conditions.forget(name)
+        else:
+            self._conditions.end(name, text, now)
 
     def report_quiet(self, is_quiet: bool, now: int) -> None:
         """Log the begin or the end of quiet mode."""
