@@ -35,10 +35,6 @@ _DEGRADED_BYTES_PER_DROPPED = 10
 _MOST_FRAMES = 100_000_000
 """The rate counts at most so many live frames in a second. The core in C has the same limit, so
 that the rate stays in 32 bits."""
-# Members of an enumeration are slow to look up.
-_NEVER_SEEN = LinkState.NEVER_SEEN
-_OK = LinkState.OK
-_DEGRADED = LinkState.DEGRADED
 
 
 class EscStream(EscTelemetry):
@@ -144,7 +140,7 @@ class EscStream(EscTelemetry):
                 self.late_frames += 1
             else:
                 yield self.accept(reading, shown - after_ns, bound - after_ns)
-        if self.link is _NEVER_SEEN:
+        if self.link is LinkState.NEVER_SEEN:
             yield self._set_link(LinkState.SEARCHING)
 
     def port_opened(self) -> int:
@@ -230,8 +226,8 @@ class EscStream(EscTelemetry):
         self.last_live = data
         self.live_ns = when
         self.live_bound_ns = bound
-        if self.link is not _OK and self.link is not _DEGRADED:
-            events |= self._set_link(_OK)
+        if self.link not in (LinkState.OK, LinkState.DEGRADED):
+            events |= self._set_link(LinkState.OK)
             self.frame_rate = None
             self._interval_ns = 0
             self._window_ns = when
@@ -319,7 +315,7 @@ class EscStream(EscTelemetry):
         has_crc_errors = crc_errors >= self.settings.crc_error_threshold
         has_gaps = dropped * _DEGRADED_BYTES_PER_DROPPED > received
         is_degraded = has_crc_errors or has_gaps
-        return Event.SECOND | self._set_link(_DEGRADED if is_degraded else _OK)
+        return Event.SECOND | self._set_link(LinkState.DEGRADED if is_degraded else LinkState.OK)
 
 
 def _window_counts(counters: Counters) -> tuple[int, int, int, int]:

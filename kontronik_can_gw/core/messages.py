@@ -8,6 +8,7 @@ message is always kept.
 """
 
 from collections.abc import Sequence
+from operator import itemgetter
 
 from kontronik_can_gw.core.interface import Place
 from kontronik_can_gw.core.output import Owner
@@ -370,8 +371,7 @@ class Messages:
         pending = self.pending
         self.pending = {}
         frames: list[CanFrame] = []
-        in_order = sorted([(since, index) for index, since in pending.items()])
-        for _, index in in_order:
+        for index, _ in sorted(pending.items(), key=itemgetter(1, 0)):
             message = self._messages[index]
             why = message.why
             message.why = 0

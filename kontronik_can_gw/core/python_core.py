@@ -179,9 +179,10 @@ class PythonCore:
         return bool(self.messages.pending) or self.slots.is_pending
 
     def take(self, now: int) -> list[CanFrame]:
-        slots = self.slots.take(now)
-        messages = self.messages.take(now)
-        return slots + messages if slots else messages
+        frames: list[CanFrame] = []
+        for slot in self.slots.take(now):
+            frames += slot.frames
+        return frames + self.messages.take(now)
 
     def take_oldest(self, now: int) -> list[CanFrame]:
         if self.slots.pending_since <= self.messages.pending_since:

@@ -374,18 +374,11 @@ class Slots:
         others = self.pending
         place = min(others, key=lambda each: (others[each], each))
         self.pending = {place: others.pop(place)}
-        frames = self.take(now)
+        (slot,) = self.take(now)
         self.pending = others | self.pending
-        return frames
+        return slot.frames
 
-    def take(self, now: int) -> list[CanFrame]:
-        """Return the frames of the pending slots, in their order."""
-        frames: list[CanFrame] = []
-        for slot in self.take_each(now):
-            frames += slot.frames
-        return frames
-
-    def take_each(self, now: int) -> list[PendingSlot]:
+    def take(self, now: int) -> list[PendingSlot]:
         """Return the pending slots in their order, each with its frames."""
         if not self.pending:
             return []

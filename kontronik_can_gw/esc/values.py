@@ -117,13 +117,6 @@ class Value:
         return None
 
 
-# Members of an enumeration are slow to look up.
-_ONE = Divisor.ONE
-_POLE_PAIRS = Divisor.POLE_PAIRS
-_OUTPUT = Divisor.OUTPUT
-_PRODUCT = Kind.PRODUCT
-
-
 def steps(
     value: Value,
     esc: EscTelemetry,
@@ -151,7 +144,7 @@ def steps_of(
     if reading is None or not value.words:
         return None
     word = reading[value.words[0]]
-    if value.kind is _PRODUCT:
+    if value.kind is Kind.PRODUCT:
         return word * reading[value.words[1]]
     count = word >> value.shift & value.mask
     if value.negative_in is not None:
@@ -165,11 +158,11 @@ def steps_of(
 
 def divisor(value: Value, esc: EscTelemetry) -> tuple[int, int] | None:
     """Return numerator and denominator of the value's divisor. None if it is unknown."""
-    if value.divisor is _ONE:
+    if value.divisor is Divisor.ONE:
         return 1, 1
-    if value.divisor is _POLE_PAIRS:
+    if value.divisor is Divisor.POLE_PAIRS:
         return esc.pole_pairs, 1
-    if value.divisor is _OUTPUT:
+    if value.divisor is Divisor.OUTPUT:
         return esc.output_divisor, esc.gear_denominator
     cells = esc.last_cells
     return (cells, 1) if cells else None
@@ -188,8 +181,21 @@ def scaled(
     parts = divisor(value, esc)
     if count is None or parts is None:
         return None
-    numerator = count * slope.numerator * parts[1]
-    denominator = slope.denominator * parts[0]
+    return rounded(count, slope, parts)
+
+
+def rounded(
+    count: int,
+    slope: Fraction,
+    parts: tuple[int, int],
+    intercept: Fraction = Fraction(0),
+) -> int:
+    """Return ``count`` x ``slope`` / ``parts`` + ``intercept``, rounded once, halves up."""
+    over, under = parts
+    times, by = slope.as_integer_ratio()
+    plus, of = intercept.as_integer_ratio()
+    denominator = by * over * of
+    numerator = count * times * under * of + plus * by * over
     return (2 * numerator + denominator) // (2 * denominator)
 
 
@@ -206,7 +212,7 @@ def physical(
     parts = divisor(value, esc)
     if count is None or parts is None:
         return None
-    if value.per_unit == 1 and value.divisor is _ONE:
+    if value.per_unit == 1 and value.divisor is Divisor.ONE:
         return count
     over, under = parts
     return round(count * under / (value.per_unit * over), 6)

@@ -262,7 +262,7 @@ class NativeCore:
 
     def take(self, now: int) -> list[CanFrame]:
         frames: list[CanFrame] = []
-        in_python = self._slots.take_each(now)
+        in_python = self._slots.take(now)
         library = self.library
         core = self.core
         while count := library.kcg_take(core, now, self._frames, _MAX_FRAMES):

@@ -7,11 +7,11 @@ whose bit 0 is bit 0 of byte 0.
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 
 from kontronik_can_gw.esc.telemetry import EscTelemetry
-from kontronik_can_gw.esc.values import divisor, steps
+from kontronik_can_gw.esc.values import Value, divisor, rounded, steps
 from kontronik_can_gw.frames import FIRST_PART, CanFrame
 from kontronik_can_gw.signals.e2e import Protection
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
@@ -24,8 +24,6 @@ The group is given by its position in ``MessagePlan.pages``.
 """
 MakeFrame = Callable[[Sequence[EscTelemetry], GatewayStatus, int, int, int], CanFrame]
 """Maps the same arguments to the frame, with its CRC."""
-_ReadRaw = Callable[[Sequence[EscTelemetry], GatewayStatus, int], int]
-"""Maps ESCs, gateway and time to a signal's raw value."""
 _FLOATS = {16: "<e", 32: "<f", 64: "<d"}
 """struct codes of IEEE 754 numbers by their length in bits."""
 
@@ -35,7 +33,10 @@ def place(pieces: Sequence[Piece], raw: int) -> int:
 
     Bits beyond the pieces are cut off, so a negative value is stored as two's complement.
     """
-    return sum([(raw >> piece.shift & (1 << piece.width) - 1) << piece.at for piece in pieces])
+    bits = 0
+    for piece in pieces:
+        bits |= (raw >> piece.shift & (1 << piece.width) - 1) << piece.at
+    return bits
 
 
 def extract(pieces: Sequence[Piece], bits: int) -> int:
@@ -69,8 +70,9 @@ def compile_pack(plan: MessagePlan) -> Pack:
         at: int,
     ) -> int:
         bits, sources = pages[at]
-        for pieces, read_raw in sources:
-            bits |= place(pieces, read_raw(escs, gateway, now))
+        for signal, source in sources:
+            esc = escs[signal.esc or 0]
+            bits |= place(signal.pieces, raw_value(signal, source, esc, gateway, now))
         for pieces, modulus in counters:
             bits |= place(pieces, alive % modulus)
         return bits
@@ -102,8 +104,8 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
 
 def _compile_page(
     plan: MessagePlan, page: int | None
-) -> tuple[int, list[tuple[tuple[Piece, ...], _ReadRaw]]]:
-    """Return a group's constant bits, and pieces and function of each signal with a source."""
+) -> tuple[int, list[tuple[SignalPlan, Value]]]:
+    """Return a page's constant bits, and the signals with a source, each with its source."""
     constant = 0
     sources = []
     for signal in plan.signals:
@@ -114,129 +116,55 @@ def _compile_page(
         elif signal.role in (Role.CONSTANT, Role.DATA_ID):
             constant |= place(signal.pieces, signal.constant)
         elif signal.source is not None:
-            sources.append((signal.pieces, _compile_raw(signal)))
+            sources.append((signal, signal.source))
     return constant, sources
 
 
-def _compile_raw(signal: SignalPlan) -> _ReadRaw:
-    """Return the function that reads a signal's source and returns its raw value or a code."""
-    if signal.is_float:
-        return _compile_float(signal)
-    if signal.numbers is not None:
-        return _compile_enumeration(signal, signal.numbers)
-    return _compile_whole(signal)
-
-
-def _compile_whole(signal: SignalPlan) -> _ReadRaw:
-    """Return the function of a signal with an integer raw value.
-
-    The value is multiplied first and rounded once to the nearest integer, half up.
-    """
-    source = signal.source
-    assert source is not None
-    index = signal.esc or 0
-    low = signal.low
-    high = signal.high
-    error = signal.error
-    not_available = signal.not_available
-    common = signal.slope.denominator * signal.intercept.denominator
-    # Twice the numerators, so that half a raw value is a whole number.
-    factor = 2 * int(signal.slope * common)
-    offset = 2 * int(signal.intercept * common) + common
-
-    def read_raw(
-        escs: Sequence[EscTelemetry],
-        gateway: GatewayStatus,
-        now: int,
-    ) -> int:
-        esc = escs[index]
-        count = steps(source, esc, gateway, now)
-        if count is None:
-            return not_available
-        parts = divisor(source, esc)
-        if parts is None:
-            return not_available
-        over, under = parts
-        dividend = count * factor * under + offset * over
-        value = dividend // (2 * common * over)
-        if source.rolls:
-            return value % (high + 1)
-        if signal.saturates and value < low:
-            return low
-        # A true value must not be mistaken for a code that lies within the values.
-        return value if low <= value <= high and value != not_available else error
-
-    return read_raw
-
-
-def _compile_enumeration(signal: SignalPlan, numbers: Mapping[int, int]) -> _ReadRaw:
-    """Return the function of a signal that sends a raw value for each number of its source."""
-    source = signal.source
-    assert source is not None
-    index = signal.esc or 0
-    error = signal.error
-    not_available = signal.not_available
-
-    def read_raw(
-        escs: Sequence[EscTelemetry],
-        gateway: GatewayStatus,
-        now: int,
-    ) -> int:
-        esc = escs[index]
-        count = steps(source, esc, gateway, now)
-        if count is None or divisor(source, esc) is None:
-            return not_available
-        return numbers.get(count, error)
-
-    return read_raw
-
-
-def _compile_float(signal: SignalPlan) -> _ReadRaw:
-    """Return the function of a signal whose raw value is an IEEE 754 number."""
-    source = signal.source
-    assert source is not None
-    index = signal.esc or 0
-    low, high = signal.limits
-    length = signal.length
-    error = signal.error
-    not_available = signal.not_available
-
-    def read_raw(
-        escs: Sequence[EscTelemetry],
-        gateway: GatewayStatus,
-        now: int,
-    ) -> int:
-        esc = escs[index]
-        count = steps(source, esc, gateway, now)
-        if count is None:
-            return not_available
-        parts = divisor(source, esc)
-        if parts is None:
-            return not_available
-        number = _scale_to_float(signal, count, parts)
-        if number is None or not low <= number <= high:
-            return error
-        bits = float_bits(number, length)
-        return error if bits is None or bits == not_available else bits
-
-    return read_raw
-
-
-def _scale_to_float(
+def raw_value(
     signal: SignalPlan,
-    count: int,
-    parts: tuple[int, int],
-) -> float | None:
-    """Return the number to send for ``count`` steps and this divisor, computed with one division.
+    source: Value,
+    esc: EscTelemetry,
+    gateway: GatewayStatus,
+    now: int,
+) -> int:
+    """Return the raw value of a signal, or its code for an error or for "not available".
 
-    None for a number that the signal's value table does not contain.
+    The value is multiplied first and rounded once, halves up. A true value must not be mistaken for
+    a code that lies within the values.
     """
+    count = steps(source, esc, gateway, now)
+    parts = divisor(source, esc)
+    if count is None or parts is None:
+        return signal.not_available
+    if signal.is_float:
+        raw = _float_raw(signal, count, parts)
+    elif signal.numbers is not None:
+        return signal.numbers.get(count, signal.error)
+    else:
+        raw = rounded(count, signal.slope, parts, signal.intercept)
+        if source.rolls:
+            return raw % (signal.high + 1)
+        if not signal.low <= raw <= signal.high:
+            return signal.low if signal.saturates and raw < signal.low else signal.error
+    return signal.error if raw is None or raw == signal.not_available else raw
+
+
+def _float_raw(signal: SignalPlan, count: int, parts: tuple[int, int]) -> int | None:
+    """Return the IEEE 754 bits of ``count`` steps with this divisor, computed with one division.
+
+    None if the number is outside the limits, or not in the signal's value table.
+    """
+    number: float | None
     if signal.numbers is not None:
-        return signal.numbers.get(count)
-    slope = signal.slope
-    over, under = parts
-    quotient = ratio(count * slope.numerator * under, slope.denominator * over)
-    return quotient + float(signal.intercept)
+        number = signal.numbers.get(count)
+    else:
+        over, under = parts
+        dividend = count * signal.slope.numerator * under
+        number = ratio(dividend, signal.slope.denominator * over) + float(signal.intercept)
+    low, high = signal.limits
+    if number is None or not low <= number <= high:
+        return None
+    return float_bits(number, signal.length)
 
 
 def ratio(numerator: int, denominator: int) -> float:

@@ -28,7 +28,6 @@ from kontronik_can_gw.esc.kontronik.codec import (
 from kontronik_can_gw.esc.kontronik.fields import Data
 from kontronik_can_gw.esc.kontronik.states import LARGEST_STATE
 
-_new = tuple.__new__
 _LEGACY_LIVE = next(form for form in FORMS if form.name == "live_legacy")
 _HEADER_LENGTH = len(PREFIX) + 1
 _LONG_RUNS = bytes(0x100 - (1 << n) for n in range(8)) + b"\0"
@@ -253,8 +252,8 @@ class Deframer:
                 crc = crc32(frame[form.crc_part], crc)
                 if crc == form.unpack_crc(frame)[0]:
                     setattr(counters, form.name, getattr(counters, form.name) + 1)
-                    data = _new(form.data_type, form.unpack_fields(frame))
-                    frames.append(_new(Frame, (form, self._base + at, data)))
+                    data = form.data_type(*form.unpack_fields(frame))
+                    frames.append(Frame(form, self._base + at, data))
                     at = end
                     self._rejected_until = 0
                     break

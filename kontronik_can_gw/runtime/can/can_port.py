@@ -23,10 +23,6 @@ RECEIVE_LIMIT = 64
 _DISCARD_LIMIT = 4096
 """The same limit of ``discard``."""
 MAX_STANDARD_ID = 0x7FF
-# An enumeration's members are slow to look up.
-_DOWN = CanState.DOWN
-_UNKNOWN = CanState.UNKNOWN
-_OK = Sent.OK
 
 Received = list[tuple[CanFrame, int | None]]
 """Frames with their times of reception on the monotonic clock. A time is None if unknown."""
@@ -135,13 +131,13 @@ class CanPort(ABC):
         meanwhile. Returns the number of accepted frames and the last result.
         """
         if self.gone:
-            self.state = _DOWN
+            self.state = CanState.DOWN
             return 0, Sent.GONE
         count, answer = self._send_each(frames, clock, latest)
-        if count and (self.state is _DOWN or self.state is _UNKNOWN):
+        if count and (self.state in (CanState.DOWN, CanState.UNKNOWN)):
             self.state = CanState.ERROR_ACTIVE
-        if answer is not _OK and (answer is Sent.DOWN or answer is Sent.GONE):
-            self.state = _DOWN
+        if answer in (Sent.DOWN, Sent.GONE):
+            self.state = CanState.DOWN
         return count, answer
 
     @abstractmethod

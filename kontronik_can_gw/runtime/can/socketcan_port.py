@@ -60,7 +60,6 @@ _CTRL_RX_OVERFLOW = 0x01
 _CTRL_WARNING = 0x0C
 _CTRL_PASSIVE = 0x30
 _CTRL_ACTIVE = 0x40
-_OK = Sent.OK
 _CAN_RAW_ERR_FILTER = 2
 _SO_TIMESTAMPNS = 64
 """Requests times of reception. Kernels before 5.1 do not have it: the time of the read is used."""
@@ -207,10 +206,10 @@ class SocketCanPort(CanPort):
                 send(packed)
             except OSError as error:
                 answer = self._send_again(packed, error)
-                if answer is not _OK:
+                if answer is not Sent.OK:
                     return count, answer
             count += 1
-        return count, _OK
+        return count, Sent.OK
 
     def _send_again(self, packed: bytes, refused: OSError) -> Sent:
         """Return the result of a refused frame.
@@ -225,7 +224,7 @@ class SocketCanPort(CanPort):
             self._socket.send(packed)
         except OSError as error:
             return _meaning(error)
-        return _OK
+        return Sent.OK
 
 
 def _monotonic(ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:

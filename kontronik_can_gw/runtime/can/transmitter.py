@@ -19,8 +19,7 @@ from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.times import MS, SECOND
 
 MAX_LATE_NS = 250 * MS
-"""Longest delay of a measurement. The shortest telemetry timeout may be a lower limit."""
-_OK = Sent.OK  # an enumeration's members are slow to look up
+"""Longest delay of a measurement. The shortest telemetry time-out may be a lower limit."""
 
 
 class Transmitter:
@@ -174,7 +173,7 @@ class Transmitter:
             gate.accepted(count, now)
             if gate.acts:
                 self.work(now)
-        if answer is _OK:
+        if answer is Sent.OK:
             return answer
         if answer is Sent.LATE:
             return None
@@ -192,7 +191,7 @@ class Transmitter:
             return None
         self.put(gateway.take_some(self.queue.share_of_measurements(room), now))
         answer = self._send(port, room, now)
-        was_refused = answer is not None and answer is not _OK
+        was_refused = answer is not None and answer is not Sent.OK
         if was_refused and gateway.is_limited and self.drop_measurements():
             gateway.limit(True, True, now)  # they would get old
         return answer
