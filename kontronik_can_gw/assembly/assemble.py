@@ -27,7 +27,7 @@ from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.runtime.can.open_can import check_interface
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import UNCONFIGURED
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Loaded:
     """The settings in effect: of the configuration, or stored by a master."""
     database: "Database | None"
     """The DBC, parsed. None without the DBC output."""
-    layout: Layout
+    layout: MessageLayout
     damaged: tuple[tuple[int, str], ...]
     """Index of each ESC whose stored parameters cannot be read, and the reason."""
     store: "ParameterStore | None"
@@ -92,7 +92,7 @@ class Loaded:
 
 def core_settings(
     escs: Sequence[EscSettings],
-    layout: Layout,
+    layout: MessageLayout,
     config: Config,
 ) -> CoreSettings:
     """Return the settings of the core according to a configuration."""
@@ -164,7 +164,7 @@ def _configured(
 
 def _load_warning(
     config: Config,
-    layout: Layout,
+    layout: MessageLayout,
     setups: Sequence[OutputSetup],
 ) -> list[str]:
     """Return a warning of the bus load in a list, or an empty list. UserError if it is too high."""
@@ -181,7 +181,7 @@ class _DbcRead:
 
     content: bytes = b""
     database: "Database | None" = None
-    layout: Layout = field(default_factory=lambda: Layout("", "", ()))
+    layout: MessageLayout = field(default_factory=lambda: MessageLayout("", "", ()))
     warnings: list[str] = field(default_factory=list)
 
 

@@ -52,7 +52,7 @@ from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import END_OF_TIME
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ class CaptureSetup:
             has_likely_data_ids=bool(dbc and dbc.get("likely_data_ids")),
         )
 
-    def database(self) -> tuple["Database", Layout] | None:
+    def database(self) -> tuple["Database", MessageLayout] | None:
         """Return the recorded DBC and its layout, or None. UserError if this version refuses it."""
         if self.dbc is None:
             return None
@@ -190,7 +190,7 @@ class CaptureSetup:
             remove_later_data_ids(database, self.dbc_settings)
         return database, prepare(database, name, self.escs, self.dbc_settings, self.fd)
 
-    def gateway(self, layout: Layout, now: int) -> Gateway:
+    def gateway(self, layout: MessageLayout, now: int) -> Gateway:
         """Return the gateway in its state before the start."""
         is_silent = self.dbc_settings.silent_on_loss
         settings = CoreSettings(self.escs, layout, is_silent, self.quiet_after_ns)

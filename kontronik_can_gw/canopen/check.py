@@ -23,7 +23,7 @@ from kontronik_can_gw.canopen.storage import COMMUNICATION as COMMUNICATION_PROF
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
-Place = tuple[int, int]
+EntryKey = tuple[int, int]
 Mistake = tuple[EdsEntry, str]
 
 _PDOS = range(COMMUNICATION, COMMUNICATION + MAX_TPDOS)
@@ -64,7 +64,7 @@ def check_eds(
         raise UserError(*(f"{eds.name}: {problem}" for problem in without_duplicates))
 
 
-def _missing(entries: Mapping[Place, EdsEntry]) -> Iterator[str]:
+def _missing(entries: Mapping[EntryKey, EdsEntry]) -> Iterator[str]:
     """Yield the mandatory objects that are missing.
 
     Each object needs its sub-index 0, and the two objects of a PDO need each other.
@@ -81,7 +81,7 @@ def _missing(entries: Mapping[Place, EdsEntry]) -> Iterator[str]:
         yield f"{index:04X}h:{sub:02X} is mandatory but missing. Add it."
 
 
-def _objects(entries: Mapping[Place, EdsEntry], shipped: Eds) -> Iterator[Mistake]:
+def _objects(entries: Mapping[EntryKey, EdsEntry], shipped: Eds) -> Iterator[Mistake]:
     """Yield mistakes in type, access and default of objects that telemetry and services use."""
     known = {(entry.index, entry.sub): entry for entry in shipped.entries}
     for (index, sub), entry in entries.items():
@@ -105,7 +105,7 @@ def _objects(entries: Mapping[Place, EdsEntry], shipped: Eds) -> Iterator[Mistak
 
 
 def _reference(
-    known: Mapping[Place, EdsEntry],
+    known: Mapping[EntryKey, EdsEntry],
     index: int,
     sub: int,
 ) -> EdsEntry | None:
@@ -146,7 +146,7 @@ def _unlike(entry: EdsEntry, shipped: EdsEntry) -> Iterator[str]:
 
 
 def _settings(
-    entries: Mapping[Place, EdsEntry],
+    entries: Mapping[EntryKey, EdsEntry],
     escs: Sequence[EscSettings],
 ) -> Iterator[Mistake]:
     """Yield configured settings that do not fit their objects."""

@@ -23,7 +23,7 @@ from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.signals.plan import Layout, classic_bits
+from kontronik_can_gw.signals.plan import MessageLayout, classic_bits
 from kontronik_can_gw.status import UNCONFIGURED, CanState, name_in_words
 from kontronik_can_gw.times import NEVER, SECOND
 
@@ -447,7 +447,7 @@ def nodes_alone(
 
     ``message_ids`` are the 11-bit ids that messages use, with their names.
     """
-    no_messages = Layout("", "", ())
+    no_messages = MessageLayout("", "", ())
     core = PythonCore(CoreSettings(escs, no_messages), 0)
     for can_id, name in message_ids.items():
         core.own_ids[can_id] = Owner(None, name)

@@ -50,7 +50,7 @@ _LIMITS_OF_PLACE = (
     (-1, END_OF_TIME - 1),
     (0, 1),
 )
-"""Limits of the numbers of ``core.interface.Place``."""
+"""Limits of the numbers of ``core.interface.SchedulePosition``."""
 _MAX_HELD = 0xFF
 """Limit of the bytes that a decoder holds."""
 _LIMITS_OF_GATEWAY = {

@@ -17,7 +17,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.runtime.status.statistics import NOT_OURS, has_other_content
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import UNCONFIGURED
 
 _EXAMPLE_PORT = "_EXAMPLE-"
@@ -133,7 +133,7 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
         yield f"  at worst  {worst:.1%}, {worst_frames:.0f} frames/s: {condition}"
 
 
-def _protected(layout: Layout) -> dict[str, list[str]]:
+def _protected(layout: MessageLayout) -> dict[str, list[str]]:
     """Return the names of the protected messages by their E2E profile."""
     found: dict[str, list[str]] = {}
     for message in layout.messages:

@@ -210,7 +210,7 @@ def _hold(locks: Locks, channel: str, recording: PlayedInput) -> None:
     Raises RunError if a gateway sends them already.
     """
     gateway = recording.setup.gateway(recording.sent_layout, recording.created_ns)
-    for taken in locks.hold(names_of(gateway, channel)):
+    for taken in locks.lock_only(names_of(gateway, channel)):
         raise in_use(taken)
 
 

@@ -11,7 +11,7 @@ from kontronik_can_gw.cli.arguments import LAYOUT, number_from, option
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.desk import bus_layout, given_layout
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
-from kontronik_can_gw.desk.sources import Bus, Recording, Source, can_config
+from kontronik_can_gw.desk.sources import Bus, PlayedRecording, Source, can_config
 from kontronik_can_gw.errors import UserError
 
 SOURCE_OPTIONS = (
@@ -99,7 +99,7 @@ def source_of(
             )
         if args.channel is not None:
             opened.select_channel(args.channel)
-        with closing(Recording(opened, args.speed or 1.0, at_once=at_once)) as played:
+        with closing(PlayedRecording(opened, args.speed or 1.0, at_once=at_once)) as played:
             yield played
         lines = [*opened.damage, *opened.notes, opened.left_out]
         for line in dict.fromkeys(filter(None, lines)):

@@ -27,7 +27,7 @@ class Follower(NamedTuple):
     on_event: OnEvent
 
 
-class Place(NamedTuple):
+class SchedulePosition(NamedTuple):
     """The state of a message that a replay cannot compute if it begins later. Times are in ns."""
 
     alive: int
@@ -96,7 +96,7 @@ class Core(Protocol):
 
     # --- a replay that begins later in a run
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[SchedulePosition]:
         """Return the place of each message in its schedule."""
 
     def adopt_places(self, places: Sequence[Sequence[int]]) -> None:

@@ -10,14 +10,14 @@ message is always kept.
 from collections.abc import Sequence
 from operator import itemgetter
 
-from kontronik_can_gw.core.interface import Place
+from kontronik_can_gw.core.interface import SchedulePosition
 from kontronik_can_gw.core.output import Owner
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.signals.packer import alive_modulus, compile_frame
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SendType
+from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan, Role, SendType
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, NEVER
 
@@ -156,10 +156,10 @@ class _Message(Traits):
             self._cycle_deferred = True
         return when, why
 
-    def schedule_place(self) -> Place:
+    def schedule_place(self) -> SchedulePosition:
         """Return its place in the schedule."""
         deferred_until = -1 if self._deferred_until == NEVER else self._deferred_until
-        return Place(
+        return SchedulePosition(
             self.alive,
             self.place,
             max(-1, self._sent_ns),
@@ -167,7 +167,7 @@ class _Message(Traits):
             int(self._cycle_deferred),
         )
 
-    def adopt(self, place: Place) -> None:
+    def adopt(self, place: SchedulePosition) -> None:
         """Continue from this place."""
         self.alive = place.alive % max(1, self.alive_modulus)
         self.place = place.page % len(self.plan.pages)
@@ -212,7 +212,7 @@ class _Message(Traits):
         return place
 
 
-def own_ids(layout: Layout) -> dict[int, Owner]:
+def own_ids(layout: MessageLayout) -> dict[int, Owner]:
     """Return the ids of the messages (with EXTENDED if they have 29 bits) and their owners."""
     owners = {}
     for plan in layout.messages:
@@ -266,14 +266,14 @@ class Messages:
 
     # --- a replay that begins later in a run
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[SchedulePosition]:
         """Return the place of each message in its schedule."""
         return [message.schedule_place() for message in self._messages]
 
     def adopt_places(self, places: Sequence[Sequence[int]]) -> None:
         """Continue from these places."""
         for message, place in zip(self._messages, places, strict=False):
-            message.adopt(Place(*place))
+            message.adopt(SchedulePosition(*place))
 
     # --- what makes messages pending
 

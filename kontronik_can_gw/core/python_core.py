@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from kontronik_can_gw.core.esc_stream import EscStream
-from kontronik_can_gw.core.interface import Follower, Place
+from kontronik_can_gw.core.interface import Follower, SchedulePosition
 from kontronik_can_gw.core.messages import Messages, own_ids
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.core.slots import Slots
@@ -77,7 +77,7 @@ class PythonCore:
 
     # --- a replay that begins later in a run
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[SchedulePosition]:
         return self.messages.places()
 
     def adopt_places(self, places: Sequence[Sequence[int]]) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class CoreSettings:
     """
 
     escs: Sequence[EscSettings]
-    layout: Layout
+    layout: MessageLayout
     """The messages of the DBC. They may be none."""
     silent_on_loss: bool = False
     """Messages stop while telemetry is lost (``core/messages.py: Traits``)."""

@@ -104,7 +104,7 @@ class Slot(Protocol):
         """Send a frame without regard to the inhibit time."""
 
 
-Place = tuple[int, int]
+SlotKey = tuple[int, int]
 """Index of the ESC, and number of the slot among this ESC's slots."""
 
 
@@ -112,14 +112,14 @@ class PendingSlot(NamedTuple):
     """A slot that was pending, with the frames to send."""
 
     since: int
-    place: Place
+    place: SlotKey
     frames: list[CanFrame]
 
 
 class PythonSlot:
     """A slot in plain Python."""
 
-    def __init__(self, owner: "Slots", place: Place) -> None:
+    def __init__(self, owner: "Slots", place: SlotKey) -> None:
         esc = place[0]
         self.place = place
         self.sent = 0
@@ -293,7 +293,7 @@ class Slots:
     def __init__(self, escs: Sequence[EscTelemetry], status: GatewayStatus) -> None:
         self.escs = escs
         self.status = status
-        self.pending: dict[Place, int] = {}
+        self.pending: dict[SlotKey, int] = {}
         """The slots that ``take`` sends, and the times at which they became due."""
         self.moved: set[int] = set()
         """ESCs of slots whose ``due`` changed."""

@@ -27,7 +27,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.values import VALUES, Group
 from kontronik_can_gw.frames import block_of
 from kontronik_can_gw.signals.packer import has_code
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, SignalPlan
+from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan, SignalPlan
 from kontronik_can_gw.status import GatewayState
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def prepare(
     settings: DbcConfig,
     fd_allowed: bool = False,
     taken_ids: Mapping[int, str] | None = None,
-) -> Layout:
+) -> MessageLayout:
     """Return the compiled layout of a gateway with these ESCs.
 
     ``taken_ids`` contains ids and blocks of ids that are already in use, and their users, for
@@ -75,7 +75,7 @@ def prepare(
     job.warnings += shared_data_ids(file, plans)
     job.warnings += _timing_warnings(job, plans)
     warnings = dict.fromkeys(job.warnings)
-    return Layout(file, node, tuple(plans), tuple(warnings))
+    return MessageLayout(file, node, tuple(plans), tuple(warnings))
 
 
 def _compiled(job: Compilation, ours: Sequence[Copy]) -> Iterator[MessagePlan]:
@@ -195,7 +195,7 @@ def _timing_warnings(job: Compilation, plans: Sequence[MessagePlan]) -> Iterator
 
 
 def check_load(
-    layout: Layout,
+    layout: MessageLayout,
     bitrate: int,
     data_bitrate: int = 2_000_000,
     further: Mapping[str, float] | None = None,
@@ -252,7 +252,7 @@ def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
     return None
 
 
-def unreported(layout: Layout, silent_on_loss: bool) -> list[str]:
+def unreported(layout: MessageLayout, silent_on_loss: bool) -> list[str]:
     """Return a warning for each message whose flags hide the loss of telemetry.
 
     ``silent_on_loss`` is True if ``dbc.on_loss`` is "silent".
@@ -276,7 +276,7 @@ def unreported(layout: Layout, silent_on_loss: bool) -> list[str]:
     return found
 
 
-def without_quiet(layout: Layout) -> list[str]:
+def without_quiet(layout: MessageLayout) -> list[str]:
     """Return a warning for each signal that cannot report quiet mode."""
     found = []
     for message in layout.messages:
@@ -291,7 +291,7 @@ def without_quiet(layout: Layout) -> list[str]:
     return found
 
 
-def unsupplied(layout: Layout, escs: Sequence[EscSettings]) -> list[str]:
+def unsupplied(layout: MessageLayout, escs: Sequence[EscSettings]) -> list[str]:
     """Return a warning for each message with values that its ESC's protocol does not have."""
     found = []
     for message in layout.messages:

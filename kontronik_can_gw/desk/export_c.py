@@ -18,7 +18,7 @@ from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.objects import FOLDER, wire_header
 from kontronik_can_gw.native.rows import Settings
 from kontronik_can_gw.native.tables import Tables
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 
 MARK = "made by kontronik-can-gw export c"
 """Text in the first line of every file. A later export may replace a file that has it."""
@@ -81,7 +81,7 @@ def exported(
     return files
 
 
-def _options(layout: Layout, tables: Tables) -> dict[str, int]:
+def _options(layout: MessageLayout, tables: Tables) -> dict[str, int]:
     """Return the values of core.h's macros that this layout needs."""
     longest = max((plan.length for plan in layout.messages), default=0)
     has_floats = any(row.flags & KCG.REAL for row in tables.signals)

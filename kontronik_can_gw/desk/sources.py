@@ -166,7 +166,7 @@ class _FramesAhead:
         self._read.put(None)
 
 
-class Recording(Source):
+class PlayedRecording(Source):
     """A recording that is played at ``speed`` times real time.
 
     With ``at_once`` it is played as fast as it can be read. A stream is played as its frames

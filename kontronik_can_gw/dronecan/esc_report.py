@@ -63,7 +63,7 @@ class _Part(NamedTuple):
     """True if only the low bits are sent."""
 
 
-class _Layout(NamedTuple):
+class _DsdlType(NamedTuple):
     """The layout of a message."""
 
     length: int
@@ -77,8 +77,8 @@ class _Layout(NamedTuple):
 _SLOPE_HIGHER = Fraction(1, 1 << 18)
 """Slope that, with the intercept, is 1 if a bit from the 18th of the error word is set."""
 _INTERCEPT_HIGHER = Fraction(-1, 2)
-_LAYOUTS: Mapping[DataType, _Layout] = {
-    wire.STATUS: _Layout(
+_DSDL_TYPES: Mapping[DataType, _DsdlType] = {
+    wire.STATUS: _DsdlType(
         length=14,
         index_bits=(105, 5),
         parts=(
@@ -89,7 +89,7 @@ _LAYOUTS: Mapping[DataType, _Layout] = {
             _Part("output_opening", 98, 7),
         ),
     ),
-    wire.STATUS_EXTENDED: _Layout(
+    wire.STATUS_EXTENDED: _DsdlType(
         length=7,
         index_bits=(51, 5),
         parts=(
@@ -100,7 +100,7 @@ _LAYOUTS: Mapping[DataType, _Layout] = {
             _Part("operating_errors", 48, 1, _SLOPE_HIGHER, _INTERCEPT_HIGHER),
         ),
     ),
-    wire.CIRCUIT_STATUS: _Layout(
+    wire.CIRCUIT_STATUS: _DsdlType(
         length=7,
         index_bits=(0, 16),
         parts=(
@@ -111,7 +111,7 @@ _LAYOUTS: Mapping[DataType, _Layout] = {
             _Part("bec_overvoltage", 55, 1),
         ),
     ),
-    wire.TEMPERATURE: _Layout(
+    wire.TEMPERATURE: _DsdlType(
         length=5,
         index_bits=(0, 16),
         parts=(
@@ -138,7 +138,7 @@ def plans_of(
     if has_direction:
         rpm = with_direction(protocol, rpm)
     found = {}
-    for kind, layout in _LAYOUTS.items():
+    for kind, layout in _DSDL_TYPES.items():
         signals = []
         for part in layout.parts:
             value = values[part.name] if part.name else rpm
@@ -184,7 +184,7 @@ def fill(kind: DataType, index: int, errors: int) -> int:
 
     ``errors`` is the number of errors since the motor was started.
     """
-    position, bits = _LAYOUTS[kind].index_bits
+    position, bits = _DSDL_TYPES[kind].index_bits
     found = place(pieces(position, bits), index)
     if kind is wire.STATUS:
         found |= errors & 0xFFFF_FFFF

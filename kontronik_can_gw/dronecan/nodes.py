@@ -132,7 +132,7 @@ class DronecanNode:
             name = esc.settings.name
             found[f"{name}.esc_index"] = report.index
             found[f"{name}.pole_pairs"] = esc.pole_pairs
-            gear = esc.output_divisor / (esc.pole_pairs * esc.gear_denominator)
+            gear = esc.shaft_divisor / (esc.pole_pairs * esc.gear_denominator)
             found[f"{name}.gear"] = gear
         return found
 

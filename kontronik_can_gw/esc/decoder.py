@@ -168,7 +168,7 @@ def bit_texts(word: int, names: type[ErrorBit] | Sequence[ErrorBit]) -> list[str
     return [known.get(bit, f"bit{bit}") for bit in range(32) if word >> bit & 1]
 
 
-class State(NamedTuple):
+class StateText(NamedTuple):
     """An operating state of the ESC."""
 
     text: str
@@ -242,7 +242,7 @@ class EscProtocol:
     """Names of the frame layouts, beginning with number 1."""
     errors: Mapping[str, Sequence[ErrorBit]] = field(default_factory=dict)
     """Maps the name of an error word to its bits."""
-    states: Mapping[int, State] = field(default_factory=dict)
+    states: Mapping[int, StateText] = field(default_factory=dict)
     backward_states: frozenset[int] = frozenset()
     """Values of ``operating_state_raw`` in which the motor turns backward."""
     devices: Mapping[int, str] = field(default_factory=dict)

@@ -109,7 +109,7 @@ class EscTelemetry:
     cells: int
     """Number of battery cells. 0: unknown."""
     pole_pairs: int
-    output_divisor: int
+    shaft_divisor: int
     """Pole pairs times the numerator of the gear."""
     gear_denominator: int
     frame_rate: int | None = 0
@@ -206,7 +206,7 @@ class EscTelemetry:
         """Replace the settings."""
         self.settings = settings
         self.pole_pairs = settings.pole_pairs
-        self.output_divisor = settings.pole_pairs * settings.gear.numerator
+        self.shaft_divisor = settings.pole_pairs * settings.gear.numerator
         self.gear_denominator = settings.gear.denominator
 
     @property

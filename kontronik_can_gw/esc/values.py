@@ -56,7 +56,7 @@ class Divisor(Enum):
 
     ONE = "1"
     POLE_PAIRS = "pole pairs"
-    OUTPUT = "pole pairs and gear"
+    SHAFT = "pole pairs and gear"
     CELLS = "cells"
 
 
@@ -162,8 +162,8 @@ def divisor(value: Value, esc: EscTelemetry) -> tuple[int, int] | None:
         return 1, 1
     if value.divisor is Divisor.POLE_PAIRS:
         return esc.pole_pairs, 1
-    if value.divisor is Divisor.OUTPUT:
-        return esc.output_divisor, esc.gear_denominator
+    if value.divisor is Divisor.SHAFT:
+        return esc.shaft_divisor, esc.gear_denominator
     cells = esc.last_cells
     return (cells, 1) if cells else None
 
@@ -269,7 +269,7 @@ def _derived_values(live: Mapping[str, Value]) -> Iterator[Value]:
             speed,
             name="output_speed",
             unit="1/min",
-            divisor=Divisor.OUTPUT,
+            divisor=Divisor.SHAFT,
         )
     if voltage is not None and current is not None:
         voltages = (voltage.low or 0, voltage.high or 0)

@@ -11,13 +11,13 @@ from kontronik_can_gw.core.interface import Core
 from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.packer import MakeFrame, compile_frame
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
+from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan, Role, SignalPlan
 
 
 class FrameSource:
     """The part of a gateway that gives frames for the bus."""
 
-    def __init__(self, core: Core, outputs: Sequence[Output], layout: Layout) -> None:
+    def __init__(self, core: Core, outputs: Sequence[Output], layout: MessageLayout) -> None:
         self.core = core
         self.outputs = outputs
         self.output_frames: list[CanFrame] = []

@@ -14,11 +14,11 @@ from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.binding import Frame, frames_in
 from kontronik_can_gw.native.header import KCG, structure
-from kontronik_can_gw.native.rows import NotInCore, Rows, Settings, SlotRow, held_settings
+from kontronik_can_gw.native.rows import NotInCore, Settings, SlotRow, TableRows, held_settings
 from kontronik_can_gw.native.scale import rescaled
 from kontronik_can_gw.native.slots import (
     NativeSlot,
-    Place,
+    ReservedRows,
     frame_count,
     reserve,
     slot_rows,
@@ -43,7 +43,7 @@ _Sending = structure("kcg_sending")
 
 def _array(kind: Any, rows: Any) -> Any:
     """Return a ctypes array of the rows. An empty table has one row of zeros."""
-    if isinstance(rows, Rows) and rows:
+    if isinstance(rows, TableRows) and rows:
         return (kind * len(rows)).from_buffer(rows.data)
     return (kind * max(1, len(rows)))(*rows)
 
@@ -166,7 +166,7 @@ class NativeCore:
 
     def write_slot(
         self,
-        place: Place,
+        place: ReservedRows,
         esc: int,
         settings: SlotSettings,
     ) -> bool:

@@ -344,7 +344,7 @@ static void note_answer(const struct pollfd *p, kcg_input *in, int64_t asked)
 }
 
 /* Restores the settings of ports if another program, for example stty, has changed them. */
-static void hold_settings(kcg_turns *t)
+static void restore_settings(kcg_turns *t)
 {
     t->times.settings_checked = t->times.polled;
     for (uint32_t i = 0; i < t->ports.count; i++) {
@@ -374,7 +374,7 @@ static void ask_all(kcg_turns *t)
             note_answer(&p->fds[i], in, times->polled);
     }
     if (times->polled - times->settings_checked >= CHECK_EACH)
-        hold_settings(t);
+        restore_settings(t);
 }
 
 /* Polls the ports that were read in this iteration, because a read may have left bytes. poll,

@@ -37,7 +37,7 @@ MAX_GEAR = 0xF_FFFF
 """Limit of both parts of a gear in lowest terms. For example, 9.81818 is 490909/50000."""
 
 
-class Rows:
+class TableRows:
     """Rows of a table, stored one after the other in ``data`` as the core reads them.
 
     Thousands of objects would leave memory behind that is never returned to the system.

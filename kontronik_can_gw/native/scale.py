@@ -29,10 +29,10 @@ _TYPE_RANGES = {
 _LARGEST_DIVISOR = {
     Divisor.ONE: (1, 1),
     Divisor.POLE_PAIRS: (MAX_POLES, 1),
-    Divisor.OUTPUT: (MAX_POLES * MAX_GEAR, MAX_GEAR),
+    Divisor.SHAFT: (MAX_POLES * MAX_GEAR, MAX_GEAR),
     Divisor.CELLS: (MAX_CELLS, 1),
 }
-_OF_SETTINGS = (Divisor.POLE_PAIRS, Divisor.OUTPUT)
+_OF_SETTINGS = (Divisor.POLE_PAIRS, Divisor.SHAFT)
 _LIMIT = 1 << 63
 _HALF = Fraction(1, 2)
 _DIGITS = range(15, 6, -1)
@@ -303,7 +303,7 @@ def _ratio(divisor: Divisor, esc: EscSettings) -> Fraction:
     """Return the divisor of a value's steps with these settings."""
     if divisor is Divisor.ONE:
         return Fraction(1)
-    return esc.pole_pairs * (esc.gear if divisor is Divisor.OUTPUT else Fraction(1))
+    return esc.pole_pairs * (esc.gear if divisor is Divisor.SHAFT else Fraction(1))
 
 
 def _bits_of(number: float) -> int:

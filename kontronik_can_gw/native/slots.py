@@ -10,7 +10,7 @@ from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import Message, NotInCore, Piece, Signal, SlotRow
 from kontronik_can_gw.native.tables import MAX_ROWS, Tables
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 
 MAX_SIGNALS = 8
 """Number of signals of a slot."""
@@ -20,7 +20,7 @@ _MAX_IN_ONE_FRAME = 7
 """Largest transfer in bytes that one frame can hold."""
 
 
-class Place(NamedTuple):
+class ReservedRows(NamedTuple):
     """The number of a slot, and the indices of its message, first signal and first piece."""
 
     number: int
@@ -29,7 +29,7 @@ class Place(NamedTuple):
     piece: int
 
 
-def reserve(tables: Tables, slots: int) -> list[list[Place]]:
+def reserve(tables: Tables, slots: int) -> list[list[ReservedRows]]:
     """Add empty rows for ``slots`` slots of each ESC, or for as many as there is room.
 
     Return the places of each ESC.
@@ -52,8 +52,8 @@ def reserve(tables: Tables, slots: int) -> list[list[Place]]:
     return places
 
 
-def _add(tables: Tables, esc: int) -> Place:
-    place = Place(
+def _add(tables: Tables, esc: int) -> ReservedRows:
+    place = ReservedRows(
         number=len(tables.slots),
         message=len(tables.messages),
         signal=len(tables.signals),
@@ -91,7 +91,7 @@ def slot_rows(plan: SlotPlan, protocol: str) -> Tables:
     """Return the rows of a slot for ESC 0. NotInCore if the core in C cannot express it."""
     if plan.only_python:
         raise NotInCore(plan.only_python)
-    layout = Layout("", "", (plan.message,))
+    layout = MessageLayout("", "", (plan.message,))
     settings = EscSettings(protocol=protocol)
     tables = Tables(CoreSettings((settings,), layout))
     if tables.of_settings:
@@ -126,7 +126,7 @@ class SlotHost(Protocol):
 
     def write_slot(
         self,
-        place: Place,
+        place: ReservedRows,
         esc: int,
         settings: SlotSettings,
     ) -> bool:
@@ -145,7 +145,7 @@ class NativeSlot:
     def __init__(
         self,
         host: SlotHost,
-        place: Place | None,
+        place: ReservedRows | None,
         esc: int,
         python: PythonSlot,
     ) -> None:

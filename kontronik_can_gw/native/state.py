@@ -7,7 +7,7 @@ from dataclasses import astuple
 from functools import cache
 from typing import Any, Self
 
-from kontronik_can_gw.core.interface import Place
+from kontronik_can_gw.core.interface import SchedulePosition
 from kontronik_can_gw.esc.decoder import Counters, Data, EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, LinkState
@@ -190,13 +190,15 @@ class NativeStatus(c.Structure):
         return NativeStatus.from_buffer_copy(self)
 
 
-def places_of(sending: Any, count: int) -> list[Place]:
+def places_of(sending: Any, count: int) -> list[SchedulePosition]:
     """Return the places of the first messages in their schedule (kcg_sending)."""
     found = []
     for each in sending[:count]:
         deferred_until = -1 if each.deferred == _NEVER else each.deferred
         sent_ns = max(-1, each.last)
-        found.append(Place(each.alive, each.page, sent_ns, deferred_until, each.cycle_deferred))
+        found.append(
+            SchedulePosition(each.alive, each.page, sent_ns, deferred_until, each.cycle_deferred)
+        )
     return found
 
 
@@ -213,7 +215,7 @@ def adopt_places(
     ``sending`` and ``heap`` belong to all messages and slots of the core (kcg).
     """
     for message, each, numbers in zip(messages, sending, places[:count], strict=False):
-        place = Place(*numbers)
+        place = SchedulePosition(*numbers)
         each.alive = place.alive % (message.last_alive + 1)
         each.page = place.page % max(1, message.pages)
         if place.sent_ns >= 0:

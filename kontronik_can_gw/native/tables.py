@@ -26,8 +26,8 @@ from kontronik_can_gw.native.rows import (
     NotInCore,
     Pair,
     Piece,
-    Rows,
     Signal,
+    TableRows,
     bind_direction,
     e2e_row,
     settings_of,
@@ -46,7 +46,7 @@ MAX_BITS = 64
 _DIVISORS = {
     Divisor.ONE: KCG.BY_ONE,
     Divisor.POLE_PAIRS: KCG.BY_POLES,
-    Divisor.OUTPUT: KCG.BY_OUTPUT,
+    Divisor.SHAFT: KCG.BY_OUTPUT,
     Divisor.CELLS: KCG.BY_CELLS,
 }
 _M64 = (1 << 64) - 1
@@ -63,11 +63,11 @@ class Tables:
         escs = settings.escs
         self._core_settings = settings
         self._plans = layout.messages
-        self.signals = Rows(Signal)
-        self.messages = Rows(Message)
-        self.pieces = Rows(Piece)
-        self.pairs = Rows(Pair)
-        self.e2e = Rows(E2e)
+        self.signals = TableRows(Signal)
+        self.messages = TableRows(Message)
+        self.pieces = TableRows(Piece)
+        self.pairs = TableRows(Pair)
+        self.e2e = TableRows(E2e)
         self.constants: list[int] = []
         self.esc_of: list[int] = []
         self.pages = 0

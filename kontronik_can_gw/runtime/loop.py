@@ -117,7 +117,7 @@ class Loop:
         """
         now = self._clock()
         # If the opening fails, the error is the only line of the log.
-        self.conditions.hold()
+        self.conditions.keep_back()
         try:
             # The ports are opened and locked first, so that no CAN adapter's driver opens them.
             for esc in self.escs:
@@ -132,7 +132,7 @@ class Loop:
             raise
         if self.can.port is not None:
             self.can.port.discard()  # a node must not receive frames from before its boot-up
-        self.conditions.release()
+        self.conditions.log_kept()
         self._housekeeping.publish(now)  # now, because the first call takes the longest
 
     def run(self) -> None:
@@ -186,7 +186,7 @@ class Loop:
         if now - times.settings_checked >= CHECK_EACH_NS:
             times.settings_checked = now
             for esc in self.escs:
-                esc.hold_settings()
+                esc.restore_settings()
         if now >= self._housekeeping.due:
             self._housekeeping.run(now)
 

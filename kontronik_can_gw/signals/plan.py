@@ -211,7 +211,7 @@ class MessagePlan:
 
 
 @dataclass(frozen=True)
-class Layout:
+class MessageLayout:
     """All messages that the gateway sends, and warnings about them."""
 
     file: str

@@ -206,11 +206,11 @@ def scan(source: Path) -> float:
     from kontronik_can_gw.native.binding import load
     from kontronik_can_gw.native.core import NativeCore
     from kontronik_can_gw.native.objects import shared_object
-    from kontronik_can_gw.signals.plan import Layout
+    from kontronik_can_gw.signals.plan import MessageLayout
 
     data = source.read_bytes()
     escs = [EscSettings("esc1")]
-    empty = Layout("", "", ())
+    empty = MessageLayout("", "", ())
     core = NativeCore(load(shared_object()), CoreSettings(escs, empty), 0)
     core.state.mask = 0  # no events
     begun = time.process_time()

@@ -31,10 +31,10 @@ from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import CanState
 
-EMPTY = Layout("", "", ())
+EMPTY = MessageLayout("", "", ())
 OFF = 0xC0000000
 """A COB-ID of a TPDO that does not exist."""
 
@@ -108,7 +108,7 @@ class Bench(Talker):
         eds: Eds | None = None,
         stored: Sequence[Stored] | None = None,
         node_ids: Sequence[int] | None = None,
-        layout: Layout = EMPTY,
+        layout: MessageLayout = EMPTY,
         escs: Mapping[str, Any] | Sequence[EscSettings] = MappingProxyType({}),
         boot: bool = True,
         **settings: Any,

@@ -18,7 +18,7 @@ from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored, encode
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.runtime.system.machine import machine_identity, serial_number
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 
 pytestmark = pytest.mark.promise("cia-301")
 
@@ -104,7 +104,7 @@ def test_a_restricted_cob_id_is_refused_and_every_other_is_accepted() -> None:
 
 def test_ids_of_pdos_of_all_nodes_and_of_the_dbc_cannot_be_used() -> None:
     ours = {0x705: 5, 0x606: 6, 0x587: 7, 0x88: 8, 0x18A: 10}
-    layout = Layout("", "", tuple(message_plan(f"M{i}", i, ()) for i in (0x222, *ours)))
+    layout = MessageLayout("", "", tuple(message_plan(f"M{i}", i, ()) for i in (0x222, *ours)))
     bench = Bench(2, changes={**NO_HEARTBEAT, **SPARE}, layout=layout)
     for cob_id in (0x181, 0x381, 0x182, 0x482, 0x81, 0x82, 0x80, 0x222):
         assert bench.write(0x1804, 1, 0x40000000 | cob_id) == TAKEN, hex(cob_id)

@@ -18,7 +18,7 @@ from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.eds import Eds, EdsEntry
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import EscConfig
-from kontronik_can_gw.esc.kontronik.fields import DataType, InfoData, LiveData, Row, rows
+from kontronik_can_gw.esc.kontronik.fields import DataType, FieldRow, InfoData, LiveData, rows
 
 pytestmark = pytest.mark.promise("shipped-eds")
 
@@ -50,7 +50,7 @@ def title(field: str) -> str:
     return words[0].upper() + words[1:]
 
 
-def extremes() -> dict[str, Row]:
+def extremes() -> dict[str, FieldRow]:
     names = InfoData._fields[InfoData._fields.index("max_electrical_speed") :]
     return {name: rows(InfoData)[name] for name in names}
 

@@ -20,7 +20,7 @@ from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, Simulat
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
@@ -38,7 +38,7 @@ def made(
     dronecan: Mapping[str, object] | None = None,
     quiet_after_s: int = 0,
     **dbc: object,
-) -> tuple[CaptureSetup, Layout]:
+) -> tuple[CaptureSetup, MessageLayout]:
     """Return the setup of a gateway and the layout of its messages.
 
     ``of_esc`` returns the configuration of an ESC without its port.
@@ -63,7 +63,7 @@ class Bench:
     """
 
     setup: CaptureSetup
-    layout: Layout
+    layout: MessageLayout
     entries: list[Entry] = field(default_factory=list)
     sent: list[TimedFrame] = field(default_factory=list)
 

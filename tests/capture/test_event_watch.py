@@ -13,7 +13,7 @@ from kontronik_can_gw.esc.kontronik.states import OperatingError, SelfTestError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.files.event_watch import EventWatch
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS, SECOND
 
 pytestmark = [
@@ -35,7 +35,7 @@ class Watched:
 
     def __post_init__(self) -> None:
         escs = [EscSettings("left"), EscSettings("right")]
-        self.gateway = Gateway(CoreSettings(escs, Layout("", "", ())), START)
+        self.gateway = Gateway(CoreSettings(escs, MessageLayout("", "", ())), START)
         EventWatch(self.gateway, self.config, self._event, lambda: 1.0)
         self.gateway.start(START)
 

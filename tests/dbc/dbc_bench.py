@@ -17,7 +17,7 @@ from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.signals.packer import compile_pack
-from kontronik_can_gw.signals.plan import Layout, MessagePlan
+from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan
 from kontronik_can_gw.times import MS
 
 
@@ -37,7 +37,7 @@ NOW = 50 * MS
 FILE = "my_car.dbc"
 
 
-def compiled(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> Layout:
+def compiled(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> MessageLayout:
     """Return the layout of a DBC for ESCs of these names. ``settings`` are fields of DbcConfig."""
     escs = [EscSettings(name, 7) for name in names]
     database = parse_database(text.encode(), FILE)
@@ -59,7 +59,7 @@ def refused(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> lis
     return lines
 
 
-def gateway_with(layout: Layout, *lives: LiveData) -> Gateway:
+def gateway_with(layout: MessageLayout, *lives: LiveData) -> Gateway:
     """Return a gateway whose ESCs (esc1, esc2 ...) have just sent this data.
 
     Without data the gateway has one ESC, which has sent nothing.

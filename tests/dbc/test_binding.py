@@ -20,7 +20,7 @@ from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS
 
 pytestmark = pytest.mark.promise("binding")
@@ -37,7 +37,9 @@ LIVE = LiveData(
 )
 
 
-def layout_of(messages: Sequence[Msg], names: Sequence[str] = ("esc1",), **more: Any) -> Layout:
+def layout_of(
+    messages: Sequence[Msg], names: Sequence[str] = ("esc1",), **more: Any
+) -> MessageLayout:
     return compiled(dbc_text(messages), names, **more)
 
 

@@ -23,7 +23,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc import values
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.signals.plan import Layout, SignalPlan
+from kontronik_can_gw.signals.plan import MessageLayout, SignalPlan
 from kontronik_can_gw.signals.units import conversion, says_nothing
 
 pytestmark = pytest.mark.promise("dbc-as-it-is")
@@ -81,7 +81,9 @@ def by_unit(messages: Iterable[Message]) -> dict[str, str]:
     return found
 
 
-def prepared(database: Database, file: str, settings: DbcConfig) -> tuple[Layout | None, list[str]]:
+def prepared(
+    database: Database, file: str, settings: DbcConfig
+) -> tuple[MessageLayout | None, list[str]]:
     """Return the layout of a gateway and no lines, or the lines of the refusal."""
     try:
         return prepare(database, file, ESCS, settings, True), []
@@ -93,7 +95,7 @@ def prepared(database: Database, file: str, settings: DbcConfig) -> tuple[Layout
         return None, list(error.problems)
 
 
-def accepted(file: Path) -> Iterator[tuple[Database, Layout, DbcConfig]]:
+def accepted(file: Path) -> Iterator[tuple[Database, MessageLayout, DbcConfig]]:
     """Yield database, layout and settings for each node of a DBC, if one of its messages is sent.
 
     The assertions check the refusals.
@@ -134,7 +136,9 @@ def check_file(file: Path) -> None:
         check_frames(database, layout, settings.bind)
 
 
-def check_frames(database: Database, layout: Layout, bound: Mapping[str, str | float]) -> None:
+def check_frames(
+    database: Database, layout: MessageLayout, bound: Mapping[str, str | float]
+) -> None:
     """Assert that each value is the nearest step, and that start values are as in the file.
 
     A value may be wrong only if it is outside the range of the signal.

@@ -25,7 +25,7 @@ from kontronik_can_gw.desk.describe.tables import held
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.signals.plan import SEND_TYPES, Layout, Role, SendType
+from kontronik_can_gw.signals.plan import SEND_TYPES, MessageLayout, Role, SendType
 from kontronik_can_gw.signals.units import conversion
 from kontronik_can_gw.times import MS
 
@@ -364,7 +364,7 @@ def test_a_checksum_is_refused_until_the_configuration_defines_it(
     assert constant.messages[0].signals[0].role is Role.CONSTANT
 
 
-def roles_of(layout: Layout) -> list[Role]:
+def roles_of(layout: MessageLayout) -> list[Role]:
     """Return the roles of the signals of the only message."""
     (message,) = layout.messages
     return [signal.role for signal in message.signals]

@@ -33,7 +33,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
 from kontronik_can_gw.signals.e2e import PROFILES, DataIdMode, Profile, Protection
-from kontronik_can_gw.signals.plan import Layout, Role
+from kontronik_can_gw.signals.plan import MessageLayout, Role
 from kontronik_can_gw.times import MS
 
 pytestmark = pytest.mark.promise("e2e")
@@ -114,7 +114,7 @@ def test_a_crc_with_a_list_of_data_ids_equals_the_one_of_both_packages(
 LIVE = LiveData(electrical_speed=70_000, battery_voltage=4442)
 
 
-def layout_of(name: str, bytes_: int = 8, **settings: Any) -> Layout:
+def layout_of(name: str, bytes_: int = 8, **settings: Any) -> MessageLayout:
     """Return a layout with a message M that a profile protects. It is sent by event."""
     profile = PROFILES[name]
     counter_at = profile.crc_bits
@@ -132,7 +132,7 @@ def layout_of(name: str, bytes_: int = 8, **settings: Any) -> Layout:
 class Sender:
     """A gateway with one ESC, and all frames that it has sent."""
 
-    def __init__(self, layout: Layout, start: int = 0) -> None:
+    def __init__(self, layout: MessageLayout, start: int = 0) -> None:
         self.gateway = Gateway(CoreSettings([EscSettings("esc1", 7)], layout), start)
         self.gateway.start(start)
         self.now = start
@@ -217,8 +217,8 @@ def test_a_busy_bus_loses_frames_but_never_changes_their_order(
     assert queue.replaced > 500
 
 
-def multiplexed() -> Layout:
-    """Return a layout with a message of three groups that profile 2 protects."""
+def multiplexed() -> MessageLayout:
+    """Return a layout with a message of three pages that profile 2 protects."""
     signals = [
         Sig("M_CRC", 0, 8),
         Sig("M_BZ", 8, 4),
@@ -271,7 +271,7 @@ MESSAGES = [
 NO_PROFILE = Profile("", 0, 8, 0, 0, 0, DataIdMode.BOTH)
 
 
-def profiles_of(layout: Layout) -> list[str]:
+def profiles_of(layout: MessageLayout) -> list[str]:
     return [getattr(plan.e2e, "profile", NO_PROFILE).name for plan in layout.messages]
 
 
@@ -625,7 +625,7 @@ def test_counter_and_crc_are_recognised_by_the_function_type_of_a_signal(definit
 # --- statements that are incomplete, unusual or contradictory
 
 
-def e2e_warnings(layout: Layout) -> list[str]:
+def e2e_warnings(layout: MessageLayout) -> list[str]:
     return [line for line in layout.warnings if "data ID" in line or "E2E" in line]
 
 

@@ -24,7 +24,7 @@ from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.reader import parse_database
 from kontronik_can_gw.desk.dbc import writer
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.signals.plan import Layout, MessagePlan
+from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan
 
 pytestmark = pytest.mark.promise("expansion")
 
@@ -248,7 +248,7 @@ def test_names_of_more_than_32_characters_are_refused() -> None:
 # --- the written file describes the frames that are sent
 
 
-def plain_plans(layout: Layout) -> list[MessagePlan]:
+def plain_plans(layout: MessageLayout) -> list[MessagePlan]:
     """Return the plans with their signals sorted by name, because the writer sorts them."""
     plans = []
     for plan in layout.messages:

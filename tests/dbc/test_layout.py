@@ -13,7 +13,7 @@ from packer_oracle import Msg, Sig, dbc_text
 
 from kontronik_can_gw.dbc.prepare import check_load
 from kontronik_can_gw.errors import UserError
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 
 pytestmark = pytest.mark.promise("packing")
 
@@ -108,7 +108,7 @@ def layout_of(
     cycle: int = 10,
     delay: int = 0,
     frame_format: int = NO_FD,
-) -> Layout:
+) -> MessageLayout:
     if frame_format:
         frame_format += message.extended
     more = f"""BA_DEF_ BO_ "VFrameFormat" INT 0 15;
@@ -218,7 +218,7 @@ def test_the_worst_load_causes_a_warning_and_the_usual_load_a_refusal() -> None:
     assert words in warning
     with pytest.raises(UserError, match="need 101%"):
         check_load(layout, 50 * 135 * 100 // 101)
-    empty = Layout("", "", ())
+    empty = MessageLayout("", "", ())
     further = {"the CANopen nodes": 1_000.0}
     worst = {"the CANopen nodes": 6_000.0}
     assert check_load(empty, 10_000, further=further) is None
@@ -233,6 +233,6 @@ def test_the_bits_of_canopen_nodes_are_counted_too() -> None:
     words = "my_car.dbc: the messages and the CANopen nodes need 60% of 36 kbit/s"
     assert warning.startswith(words)
     assert "CANopen" not in str(check_load(layout, 18_000))
-    empty = Layout("", "", ())
+    empty = MessageLayout("", "", ())
     alone = str(check_load(empty, 1_000_000, further={"the CANopen nodes": 600_000}))
     assert alone.startswith("the CANopen nodes need 60% of 1000 kbit/s")

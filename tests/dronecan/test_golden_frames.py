@@ -25,7 +25,7 @@ from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.native.load import make_core
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.signals.transfer import transfer
 
 pytestmark = pytest.mark.promise("dronecan")
@@ -51,7 +51,7 @@ class Measuring:
         has_direction: bool = True,
     ) -> None:
         escs = [EscSettings()]
-        layout = Layout("", "", ())
+        layout = MessageLayout("", "", ())
         self.core: Any = PythonCore(CoreSettings(escs, layout), 0)
         if not is_pure:
             self.core, why = make_core(CoreSettings(escs, layout, slots=1), 0)

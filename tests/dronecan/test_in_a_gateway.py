@@ -18,7 +18,7 @@ from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.dronecan.wire import STATUS, Assembler
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS, SECOND
 
 pytestmark = pytest.mark.promise("dronecan")
@@ -253,7 +253,7 @@ def test_a_bus_that_is_too_slow_gets_complete_transfers(monkeypatch: pytest.Monk
     """Newer values of two ESCs replace waiting ones, but a transfer that began is completed."""
     world = wire_world.World(2)
     setup = loaded(2)
-    layout = Layout("", "", ())
+    layout = MessageLayout("", "", ())
     loop = wire_world.loop_in(world, monkeypatch, setup.escs, layout, outputs=setup.outputs)
     loop.open()
     loop.begin()

@@ -22,7 +22,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.system.locks import names_of
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import NmtState
 from kontronik_can_gw.times import SECOND
 
@@ -88,7 +88,7 @@ class Memory(NodeOutput):
 def test_node_output_stores_parameters_and_plain_output_is_not_asked() -> None:
     memory, plain = Memory(), Output()
     makers = [ReadyOutput(plain), ReadyOutput(memory)]
-    gateway = Gateway(CoreSettings(ESCS, Layout("", "", ())), 0, outputs=makers)
+    gateway = Gateway(CoreSettings(ESCS, MessageLayout("", "", ())), 0, outputs=makers)
     assert gateway.node_outputs == [memory]
     for number in (2, 3, 4):
         before = gateway.revision
@@ -105,7 +105,8 @@ def test_node_output_stores_parameters_and_plain_output_is_not_asked() -> None:
     assert names_of(gateway, "can0") == ["can0: memory node 5"]
 
 
-def test_a_further_output_sends_values_and_receives_commands(gateway: Gateway) -> None:
+def test_a_further_output_sends_values_and_receives_commands() -> None:
+    gateway = Gateway(CoreSettings(ESCS, MessageLayout("", "", ())), 0, outputs=[VoltagesMaker()])
     gateway.start(0)
     found = []
     for now in range(0, 4 * SECOND, SECOND // 10):
@@ -130,7 +131,8 @@ def test_a_further_output_sends_values_and_receives_commands(gateway: Gateway) -
     assert sent_for_left == [(second * SECOND, 0, "ffff") for second in (1, 2, 3)]
 
 
-def test_another_device_with_ids_of_a_further_output_is_noticed(gateway: Gateway) -> None:
+def test_another_device_with_ids_of_a_further_output_is_noticed() -> None:
+    gateway = Gateway(CoreSettings(ESCS, MessageLayout("", "", ())), 0, outputs=[VoltagesMaker()])
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
     (conflict,) = gateway.conflicts.take()

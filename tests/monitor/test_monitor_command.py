@@ -25,7 +25,7 @@ from kontronik_can_gw.desk import member, sources
 from kontronik_can_gw.desk.monitor import model, screen, status, watch
 from kontronik_can_gw.desk.receiver import bus_listener
 from kontronik_can_gw.desk.recordings.inputs import open_input
-from kontronik_can_gw.desk.sources import Recording
+from kontronik_can_gw.desk.sources import PlayedRecording
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, SimulatedEsc
 
@@ -134,7 +134,7 @@ def test_plain_bytes_of_a_uart_are_shown(tmp_path: Path) -> None:
 def test_a_recording_is_played_in_real_time(log: Path, clock: Clock, speed: float) -> None:
     late: list[float] = []
     with open_input(log) as opened:
-        recording = Recording(opened, speed)
+        recording = PlayedRecording(opened, speed)
         first = recording.now()
         begun = clock.now
 

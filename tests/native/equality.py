@@ -47,7 +47,14 @@ from kontronik_can_gw.native.rows import GATEWAY, MAX_GEAR, NotInCore
 from kontronik_can_gw.native.slots import slot_rows
 from kontronik_can_gw.signals.e2e import PROFILES, DataIdMode, Profile
 from kontronik_can_gw.signals.packer import compile_pack
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.signals.plan import (
+    MessageLayout,
+    MessagePlan,
+    Piece,
+    Role,
+    SendType,
+    SignalPlan,
+)
 from kontronik_can_gw.status import GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
@@ -109,7 +116,7 @@ def layout(
     chance: random.Random,
     escs: Sequence[EscSettings],
     most: int = 8,
-) -> Layout:
+) -> MessageLayout:
     """Return a random layout that the gateway accepts."""
     while True:
         try:
@@ -197,7 +204,7 @@ STATE = (
     "last_info_ns",
     "info_bound_ns",
     "pole_pairs",
-    "output_divisor",
+    "shaft_divisor",
     "gear_denominator",
     "energy_mw_ns",
     "run_time_ns",
@@ -362,7 +369,7 @@ class Both:
         library: Any,
         chance: random.Random,
         escs: Sequence[EscSettings],
-        layout: Layout,
+        layout: MessageLayout,
     ) -> None:
         self.chance = chance
         self.escs = escs

@@ -15,7 +15,7 @@ from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.export_c import exported
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.rows import NotInCore
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import CanState, GatewayState
 from kontronik_can_gw.times import MS, SECOND
 
@@ -31,7 +31,7 @@ class Case:
         self,
         folder: Path,
         seed: int,
-        layout: Layout | None = None,
+        layout: MessageLayout | None = None,
         escs: Sequence[EscSettings] | None = None,
     ) -> None:
         chance = random.Random(seed)

@@ -18,7 +18,7 @@ from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.rows import NotInCore
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS
 
 UNITS = {
@@ -67,7 +67,7 @@ def signals(chance: random.Random, digits: int) -> Iterator[tuple[str, str]]:
         yield source, line
 
 
-def scaled(seed: int, digits: int) -> tuple[list[EscSettings], Layout]:
+def scaled(seed: int, digits: int) -> tuple[list[EscSettings], MessageLayout]:
     """Return a random ESC and a layout that the gateway accepts."""
     chance = random.Random(seed)
     gears = [Fraction(1), Fraction(str(chance.randint(1, 2000) / 100)), Fraction("9.81818")]

@@ -34,7 +34,7 @@ from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.objects import OPTIONS
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.native.tables import Tables
-from kontronik_can_gw.signals.plan import Layout, SendType
+from kontronik_can_gw.signals.plan import MessageLayout, SendType
 from kontronik_can_gw.times import MS, SECOND
 
 pytestmark = pytest.mark.promise("both-cores")
@@ -296,7 +296,7 @@ def test_a_value_that_the_c_core_does_not_compute_is_refused_by_name() -> None:
     (signal,) = plan.signals
     other = replace(plan, compiled=(replace(signal, source=bec),))
     with pytest.raises(NotInCore, match=r"^M\.S: BEC power is computed in Python only$"):
-        Tables(CoreSettings([EscSettings("esc1")], Layout("", "", (other,))))
+        Tables(CoreSettings([EscSettings("esc1")], MessageLayout("", "", (other,))))
 
 
 def test_every_value_of_the_product_has_a_source_in_c() -> None:
@@ -327,7 +327,9 @@ def _sort_calls(library: Any, messages: int) -> int:
     by_time = replace(plan, send_type=SendType.CYCLIC, cycle_ns=10 * MS, delay_ns=0)
     plans = [replace(by_event, can_id=n) for n in range(messages)]
     plans += [replace(by_time, can_id=messages + n) for n in range(messages)]
-    core = NativeCore(library, CoreSettings([EscSettings("esc1")], Layout("", "", tuple(plans))), 0)
+    core = NativeCore(
+        library, CoreSettings([EscSettings("esc1")], MessageLayout("", "", tuple(plans))), 0
+    )
     core.receive(0, encode(LiveData(electrical_speed=1), WireLayout.V4), 10 * MS, 10 * MS)
     core.advance(10 * MS)
     calls = c.c_ulong.in_dll(library, "kcg_calls")
@@ -358,7 +360,7 @@ def test_a_large_energy_is_equal_in_both_cores_and_restarts_at_0(
     native_library: Any,
     mw_s: int,
 ) -> None:
-    settings = CoreSettings((EscSettings(),), Layout("", "", ()), slots=1)
+    settings = CoreSettings((EscSettings(),), MessageLayout("", "", ()), slots=1)
     for core in (PythonCore(settings, 0), NativeCore(native_library, settings, 0)):
         slot = core.slot(0)
         slot.configure(SlotSettings(_energy_object(), 0x181, True, 0, 0), 0)
@@ -371,7 +373,7 @@ def test_a_large_energy_is_equal_in_both_cores_and_restarts_at_0(
 
 def test_a_frame_at_the_end_of_a_stream_is_found_but_not_processed(native_library: Any) -> None:
     """Later calls do not process it either. In this stream a shorter frame follows a header."""
-    core = NativeCore(native_library, CoreSettings([EscSettings()], Layout("", "", ())), 0)
+    core = NativeCore(native_library, CoreSettings([EscSettings()], MessageLayout("", "", ())), 0)
     frame = encode(LiveData(battery_voltage=2400), WireLayout.LEGACY)
     core.receive(0, b"KODI" + frame, SECOND, SECOND)
     native_library.kcg_end(core.core, 0)
@@ -388,7 +390,7 @@ def test_the_rate_counts_at_most_100_million_frames_in_a_second(
 ) -> None:
     """No UART carries so many. The limit keeps the rate of the core in C in 32 bits."""
     esc = EscSettings(timeout_ns=2 * SECOND)
-    both = equality.Both(native_library, random.Random(1), [esc], Layout("", "", ()))
+    both = equality.Both(native_library, random.Random(1), [esc], MessageLayout("", "", ()))
     reading = encode(LiveData(battery_voltage=2400), WireLayout.V4)
     both.call("receive", 0, reading, both.now, both.now)
     python, native = both.python.escs[0], both.native.escs[0]

@@ -41,7 +41,7 @@ from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native import load
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
@@ -67,7 +67,7 @@ class InC:
     def __init__(
         self,
         patch: pytest.MonkeyPatch,
-        layout: Layout | None = None,
+        layout: MessageLayout | None = None,
         escs: Sequence[EscSettings] = ESCS,
         **more: Any,
     ) -> None:
@@ -327,7 +327,7 @@ def test_an_emergency_on_a_full_bus_after_a_long_pause_is_sent_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The time without a sent frame counts only from then. It is not a stall and not a loss."""
-    it = InC(monkeypatch, Layout("", "", ()), outputs=[_nodes(ESCS)])
+    it = InC(monkeypatch, MessageLayout("", "", ()), outputs=[_nodes(ESCS)])
     it.feed(LiveData(operating_errors=(n >= 530) << 20) for n in range(600))
     it.run(1)
     assert 0x181 in dict(it.bus.take())

@@ -27,12 +27,12 @@ from kontronik_can_gw.native import load, objects
 from kontronik_can_gw.native.compile import compile_core
 from kontronik_can_gw.native.objects import sealed
 from kontronik_can_gw.native.rows import MAX_GEAR
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import SECOND
 
 pytestmark = pytest.mark.promise("which-core")
 
-EMPTY = Layout("", "", ())
+EMPTY = MessageLayout("", "", ())
 HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: Gw Car\nBO_ 256 M: 8 Gw\n SG_ {} Car\n'
 CYCLE = (
     'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 99999999999999;\n'
@@ -57,7 +57,7 @@ needs_c = pytest.mark.skipif(
 )
 
 
-def layout_of(signal: str, more: str = "", length: int = 8) -> Layout:
+def layout_of(signal: str, more: str = "", length: int = 8) -> MessageLayout:
     text = HEAD.format(signal).replace("M: 8", f"M: {length}") + more
     database = parse_database(text.encode(), "t.dbc")
     return prepare(
@@ -69,7 +69,7 @@ def layout_of(signal: str, more: str = "", length: int = 8) -> Layout:
     )
 
 
-def why(layout: Layout = EMPTY, **settings: object) -> str:
+def why(layout: MessageLayout = EMPTY, **settings: object) -> str:
     """Return why a gateway with one ESC has the Python core, or ""."""
     esc = replace(EscSettings(), **settings)  # type: ignore[arg-type]
     gateway = Gateway(CoreSettings([esc], layout), 0)

@@ -16,7 +16,7 @@ from prove_dbc import main
 from specification.quantities import QUANTITIES, Divisor
 
 from kontronik_can_gw.esc.values import VALUES
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 
 pytestmark = pytest.mark.promise("proven-dbc")
 
@@ -140,7 +140,7 @@ def test_no_signal_of_a_message_that_is_never_sent_is_proven(
 ) -> None:
     right = proof.Proof.__init__
 
-    def wrong(self: Any, database: Any, layout: Layout, *others: Any) -> None:
+    def wrong(self: Any, database: Any, layout: MessageLayout, *others: Any) -> None:
         right(self, database, replace(layout, messages=()), *others)
 
     monkeypatch.setattr(proof.Proof, "__init__", wrong)

@@ -19,7 +19,7 @@ from kontronik_can_gw.runtime.status.facts import (
 )
 from kontronik_can_gw.runtime.status.snapshot import Moment, snapshot
 from kontronik_can_gw.runtime.system.process import ProcessFacts
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS, SECOND
 
 START = 1000 * SECOND
@@ -40,7 +40,7 @@ class Bench:
         self.now = START
         names = [f"esc{number + 1}" for number in range(self.escs)]
         made = [EscSettings(name, self.settings.pole_pairs, self.settings.gear) for name in names]
-        self.gateway = Gateway(CoreSettings(made, Layout("", "", ())), START)
+        self.gateway = Gateway(CoreSettings(made, MessageLayout("", "", ())), START)
         self.gateway.start(START)
         self.simulated = [
             SimulatedEsc(self.options, seed=n, start_ns=START) for n in range(self.escs)

@@ -63,7 +63,7 @@ def test_a_flapping_condition_logs_a_bounded_number_of_lines(
     conditions = FaultLog()
     now = 0
     lines = 0
-    conditions.hold()
+    conditions.keep_back()
     for name, begins, seconds in happenings:
         now += seconds * SECOND
         if begins:

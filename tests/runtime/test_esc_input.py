@@ -31,7 +31,7 @@ from kontronik_can_gw.runtime.ports.esc_port import EscPort
 from kontronik_can_gw.runtime.ports.serial_port import NoPort, PortLost, is_mini_uart
 from kontronik_can_gw.runtime.ports.usb_adapters import UsbIdentity
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS, SECOND
 
 pytestmark = pytest.mark.promise("ports-reopen")
@@ -72,7 +72,7 @@ class Bench:
 
     def __init__(self, *paths: str) -> None:
         escs = [EscSettings(name) for name in ("left", "right")[: len(paths)]]
-        self.gateway = Gateway(CoreSettings(escs, Layout("x", "Gw", ())), 0)
+        self.gateway = Gateway(CoreSettings(escs, MessageLayout("x", "Gw", ())), 0)
         self.conditions = FaultLog()
         self.poller = World().poller
         self.lost: set[EscPort] = set()
@@ -382,7 +382,7 @@ def test_settings_changed_by_another_program_are_restored(core_language: str) ->
         def hold() -> bool:
             if core_language == "Python":
                 return port.settings_hold()
-            gateway = Gateway(CoreSettings([EscSettings()], Layout("", "", ())), 0)
+            gateway = Gateway(CoreSettings([EscSettings()], MessageLayout("", "", ())), 0)
             turns = gateway.core.turns()  # type: ignore[attr-defined]
             turns.inputs[0].settings[:] = port.settings
             assert turns.watch([(port.fileno(), select.POLLIN, 0)])

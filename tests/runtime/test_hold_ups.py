@@ -37,7 +37,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import GatewayState, NmtState
 from kontronik_can_gw.times import MS, SECOND
 
@@ -148,7 +148,7 @@ def test_the_loop_checks_its_ports_four_times_per_shortest_time_out(
     """A master may change the timeout. No message wakes the loop, and it does not check more."""
     world = World(2)
     escs = (EscSettings("esc1", timeout_ns=SECOND), EscSettings("esc2"))
-    loop = loop_in(world, monkeypatch, escs, Layout("", "", ()))
+    loop = loop_in(world, monkeypatch, escs, MessageLayout("", "", ()))
     loop.open()
     loop.begin()
     for timeout in (SECOND, 60 * MS, 20 * MS, 400 * MS):

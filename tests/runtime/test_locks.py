@@ -42,15 +42,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_lock_is_exclusive_until_it_is_released(folder: Path) -> None:
     first = Locks()
     second = Locks()
-    assert first.hold(NODES[:2]) == []
-    assert first.hold(NODES[:2]) == []
+    assert first.lock_only(NODES[:2]) == []
+    assert first.lock_only(NODES[:2]) == []
     mode = {0: 0o660}.get(os.geteuid(), 0o600)
     assert {path.stat().st_mode & 0o777 for path in folder.iterdir()} == {mode}
-    assert second.hold(NODES[1:]) == [NODES[1]]
-    assert first.hold(NODES[:1]) == []
-    assert second.hold(NODES[1:]) == []
+    assert second.lock_only(NODES[1:]) == [NODES[1]]
+    assert first.lock_only(NODES[:1]) == []
+    assert second.lock_only(NODES[1:]) == []
     first.close()
-    assert second.hold(NODES[:1]) == []
+    assert second.lock_only(NODES[:1]) == []
     second.close()
     assert list(folder.iterdir()) == []
 
@@ -66,7 +66,7 @@ def test_a_lock_is_a_regular_file(
     folder.mkdir(parents=True)
     make(path)
     locks = Locks()
-    assert locks.hold(NODES[:1]) == []
+    assert locks.lock_only(NODES[:1]) == []
     assert f"{folder}: it is not a regular file. A second gateway could use" in caplog.text
     assert [each.name for each in folder.iterdir()] == [path.name]
     locks.close()
@@ -143,7 +143,7 @@ def test_a_lock_that_cannot_be_taken_is_reported_once_and_not_needed(
         folder.touch()
     said: list[str] = []
     mine = Locks(said.append)
-    assert mine.hold(NODES[:1]) == mine.hold(NODES) == []
+    assert mine.lock_only(NODES[:1]) == mine.lock_only(NODES) == []
     mine.close()
     assert len(said) == 1
     assert "A second gateway could use" in said[0]
@@ -192,12 +192,12 @@ def test_a_node_id_assigned_by_lss_is_locked(
 ) -> None:
     link = waiting_gateway(monkeypatch)
     other = Locks()
-    assert other.hold(NODES[:1]) == []
+    assert other.lock_only(NODES[:1]) == []
     other.close()
     assign_node_id(link, 5)
-    assert other.hold(NODES[:1]) == NODES[:1]
+    assert other.lock_only(NODES[:1]) == NODES[:1]
     link.close()
-    assert other.hold(NODES[:1]) == []
+    assert other.lock_only(NODES[:1]) == []
     other.close()
 
 
@@ -207,7 +207,7 @@ def test_a_node_id_assigned_by_lss_that_another_gateway_has_is_logged(
 ) -> None:
     link = waiting_gateway(monkeypatch)
     other = Locks()
-    assert other.hold(NODES[:1]) == []
+    assert other.lock_only(NODES[:1]) == []
     assign_node_id(link, 5)
     assert "can0: CANopen node 5: used by another gateway on this machine." in caplog.text
     link.close()

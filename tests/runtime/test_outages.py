@@ -27,7 +27,7 @@ from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime.loop import Loop
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS, SECOND
 
 pytestmark = pytest.mark.promise("after-outage")
@@ -38,11 +38,11 @@ FRAME_NS = MS // 4
 HELD = 6
 """Number of frames that the kernel holds."""
 STATUS = 0x300
-NO_MESSAGES = Layout("", "", ())
+NO_MESSAGES = MessageLayout("", "", ())
 in_both_cores = pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
 
 
-def with_status() -> Layout:
+def with_status() -> MessageLayout:
     """Return the layout of ``layout_of`` and a message of the gateway's own state."""
     status = Msg("GatewayStatus", STATUS, 8, [Sig("GatewayState", 0, 8), Sig("Uptime", 32, 32)])
     return compiled(dbc_text([Msg("M0", 0x100, 8, speed_and_age()), status], TIMES), ["esc1"])
@@ -62,7 +62,7 @@ class Recorded:
     def __init__(
         self,
         patch: pytest.MonkeyPatch,
-        layout: Layout,
+        layout: MessageLayout,
         outputs: Sequence[OutputMaker] = (),
     ) -> None:
         self.entries: list[Entry] = []
@@ -183,7 +183,7 @@ def test_nothing_is_handed_over_while_no_frame_leaves(monkeypatch: pytest.Monkey
     ],
 )
 def test_the_first_frame_carries_no_measurement(
-    layout: Layout,
+    layout: MessageLayout,
     outputs: list[OutputMaker],
     first: tuple[int, bytes | None],
     monkeypatch: pytest.MonkeyPatch,

@@ -83,8 +83,8 @@ def test_without_a_session_the_folder_in_tmp_is_private_and_locks_hold(
     said: list[str] = []
     first = Locks(said.append)
     second = Locks(said.append)
-    assert first.hold(["can0: CANopen node 5"]) == []
-    assert second.hold(["can0: CANopen node 5"]) == ["can0: CANopen node 5"]
+    assert first.lock_only(["can0: CANopen node 5"]) == []
+    assert second.lock_only(["can0: CANopen node 5"]) == ["can0: CANopen node 5"]
     assert said == []
     folder = root / "tmp" / f"kontronik-can-gw-{ordinary_user}"
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -112,6 +112,6 @@ def test_a_folder_in_tmp_that_another_user_controls_is_refused(
     assert folder / "status" not in folders.status_folders()
     assert not (root / "elsewhere" / "status").exists()
     said: list[str] = []
-    assert Locks(said.append).hold(["x"]) == []
+    assert Locks(said.append).lock_only(["x"]) == []
     assert len(said) == 1
     assert "belongs to another user" in said[0]

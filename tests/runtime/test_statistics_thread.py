@@ -24,7 +24,7 @@ from kontronik_can_gw.runtime.status import statistics as statistics_module
 from kontronik_can_gw.runtime.status.snapshot import STALE_NS, Moment
 from kontronik_can_gw.runtime.status.statistics import Statistics
 from kontronik_can_gw.runtime.system.worker import Report
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import SECOND
 
 pytestmark = pytest.mark.promise("status")
@@ -35,7 +35,7 @@ PATIENCE = 60.0
 
 def numbered(number: int) -> Moment:
     """Return the Moment of a gateway that has sent this number of frames."""
-    gateway = Gateway(CoreSettings([EscSettings("esc1")], Layout("", "", ())), 0)
+    gateway = Gateway(CoreSettings([EscSettings("esc1")], MessageLayout("", "", ())), 0)
     gateway.status.sent_frames = number
     gateway.status.received_frames = 3 * number
     return moment_of(gateway, number * SECOND)

@@ -34,7 +34,7 @@ from kontronik_can_gw.runtime.ports import esc_port as esc_input
 from kontronik_can_gw.runtime.ports.serial_port import PortLost
 from kontronik_can_gw.runtime.ports.usb_adapters import UsbIdentity
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
@@ -55,7 +55,7 @@ def speed_and_age(esc: str = "") -> list[Sig]:
     return [speed, Sig(f"{esc}DataAge", 32, 16, unit="ms")]
 
 
-def layout_of(escs: Sequence[EscSettings]) -> Layout:
+def layout_of(escs: Sequence[EscSettings]) -> MessageLayout:
     """Return a layout with a message 100h, 101h … of speed and age for each ESC.
 
     Each frame of the ESC sends its message, and so does a cycle of 20 ms.
@@ -443,7 +443,7 @@ def loop_in(
     world: World,
     patch: pytest.MonkeyPatch,
     escs: Sequence[EscSettings] = (EscSettings("esc1"),),
-    layout: Layout | None = None,
+    layout: MessageLayout | None = None,
     notifier: Notifier | None = None,
     outputs: Sequence[OutputMaker] = (),
     quiet_after_s: int = 0,

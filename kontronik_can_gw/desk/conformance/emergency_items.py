@@ -18,7 +18,7 @@ from kontronik_can_gw.desk.conformance.nmt_items import (
     state_name,
 )
 from kontronik_can_gw.desk.conformance.sdo_items import VALUE_RANGE
-from kontronik_can_gw.desk.conformance.slave import NoAnswer, ReceivedFrame, SdoAbort, Slave
+from kontronik_can_gw.desk.conformance.slave import AbortedTransfer, NoAnswer, ReceivedFrame, Slave
 
 _HISTORY = 0x1003
 _ERROR_REGISTER = 0x1001
@@ -161,7 +161,7 @@ def emcy_disabled(slave: Slave) -> str:
     cob_id = _cob_id(slave)
     try:
         slave.write_number(_COB_ID, 0, 1 << 31 | cob_id)
-    except SdoAbort as abort:
+    except AbortedTransfer as abort:
         raise Skipped(f"1014h cannot be disabled ({abort})") from None
     _monitor(slave)
     _heartbeat_of_monitored_node(slave)

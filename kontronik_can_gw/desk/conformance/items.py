@@ -8,7 +8,7 @@ slave does not have the service.
 from collections.abc import Callable
 from typing import NamedTuple
 
-from kontronik_can_gw.desk.conformance.slave import SdoAbort, Slave
+from kontronik_can_gw.desk.conformance.slave import AbortedTransfer, Slave
 
 Procedure = Callable[[Slave], str]
 
@@ -61,7 +61,7 @@ def require_abort(action: Callable[[], object], *codes: int) -> str:
     """Run an action that the slave must abort with one of the codes. No code: with any code."""
     try:
         action()
-    except SdoAbort as abort:
+    except AbortedTransfer as abort:
         require(not codes or abort.code in codes, f"abort {abort.code:08X}h")
         return f"abort {abort.code:08X}h"
     raise Wrong("it was accepted")

@@ -9,7 +9,7 @@ from kontronik_can_gw.desk.conformance.sdo_items import (
     is_writable,
     name_of,
 )
-from kontronik_can_gw.desk.conformance.slave import SdoAbort, Slave
+from kontronik_can_gw.desk.conformance.slave import AbortedTransfer, Slave
 
 _NOT_NOW = (0x08000020, 0x08000021, 0x08000022, 0x08000024)
 """Abort codes of an object that exists, but whose value is not available at present."""
@@ -32,7 +32,7 @@ def od_each_object_can_be_read(slave: Slave) -> str:
             continue
         try:
             data = slave.read(variable.index, variable.subindex)
-        except SdoAbort as abort:
+        except AbortedTransfer as abort:
             not_now += abort.code in _NOT_NOW
             if abort.code not in _NOT_NOW:
                 wrong.append(f"{name_of(variable)}: {abort}")
@@ -106,7 +106,7 @@ def od_no_communication_object_beyond_the_eds(slave: Slave) -> str:
         try:
             slave.read(index)
             wrong.append(f"{index:04X}h exists")
-        except SdoAbort as abort:
+        except AbortedTransfer as abort:
             if abort.code != NO_OBJECT:
                 wrong.append(f"{index:04X}h: {abort}")
     require(not wrong, "; ".join(wrong[:4]))

@@ -14,7 +14,7 @@ from kontronik_can_gw.desk.conformance.sdo_items import (
     is_number,
     is_writable,
 )
-from kontronik_can_gw.desk.conformance.slave import ReceivedFrame, SdoAbort, Slave
+from kontronik_can_gw.desk.conformance.slave import AbortedTransfer, ReceivedFrame, Slave
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ODVariable
@@ -255,7 +255,7 @@ def pdo_remote_types(slave: Slave) -> str:
     for number in (252, 253):
         try:
             slave.write_number(_COMMUNICATION, 2, number)
-        except SdoAbort as abort:
+        except AbortedTransfer as abort:
             answers.append(str(abort))
             require(abort.code in _LIMITS, str(abort))
         else:

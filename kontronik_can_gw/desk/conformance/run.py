@@ -20,7 +20,12 @@ from kontronik_can_gw.desk.conformance import (  # these modules add their items
 )
 from kontronik_can_gw.desk.conformance.items import ITEMS, Item, Skipped, Wrong
 from kontronik_can_gw.desk.conformance.nmt_items import RESET_NODE
-from kontronik_can_gw.desk.conformance.slave import NoAnswer, SdoAbort, Slave, UnexpectedAnswer
+from kontronik_can_gw.desk.conformance.slave import (
+    AbortedTransfer,
+    NoAnswer,
+    Slave,
+    UnexpectedAnswer,
+)
 from kontronik_can_gw.errors import UserError, did_you_mean
 
 GROUPS = (
@@ -134,7 +139,7 @@ def _run_item(slave: Slave, item: Item, reason: str) -> Result:
     except Skipped as skipped:
         answer = str(skipped)
         verdict = ItemVerdict.SKIPPED
-    except (Wrong, SdoAbort, UnexpectedAnswer) as error:
+    except (Wrong, AbortedTransfer, UnexpectedAnswer) as error:
         answer = str(error)
         verdict = ItemVerdict.FAILED
     except NoAnswer:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from kontronik_can_gw.desk.conformance.items import Skipped, item, require, require_abort
 from kontronik_can_gw.desk.conformance.nmt_items import HEARTBEAT_TIME, require_heartbeat
-from kontronik_can_gw.desk.conformance.slave import SdoAbort, Slave, multiplexer
+from kontronik_can_gw.desk.conformance.slave import AbortedTransfer, Slave, multiplexer
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ODVariable
@@ -256,7 +256,7 @@ def sdo_block_upload(slave: Slave) -> str:
     plain = slave.read(index)
     try:
         begin = slave.ask(b"\xa4" + where + b"\x7f", where)
-    except SdoAbort as abort:
+    except AbortedTransfer as abort:
         if abort.code in (UNKNOWN_COMMAND, UNSUPPORTED_ACCESS):
             raise Skipped(f"no block transfer ({abort})") from None
         raise

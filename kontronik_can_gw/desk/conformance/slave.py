@@ -39,7 +39,7 @@ class NoAnswer(Exception):
     """The slave did not answer a request within the time limit."""
 
 
-class SdoAbort(Exception):
+class AbortedTransfer(Exception):
     """The slave aborted an SDO transfer."""
 
     def __init__(self, code: int) -> None:
@@ -205,14 +205,15 @@ class Slave:
         """Send an SDO request and return the answer.
 
         ``where`` is the multiplexer of the transfer, or None without a transfer. Raises
-        SdoAbort if the slave aborts the transfer, and UnexpectedAnswer if it names another object.
+        AbortedTransfer if the slave aborts the transfer, and UnexpectedAnswer if it names another
+        object.
         """
         answer = self.request(data)
         if answer[0] != ABORT:
             return answer
         if where is not None and answer[1:4] != where:
             raise UnexpectedAnswer(answer, f"which does not name {name_of_object(where)}")
-        raise SdoAbort(int.from_bytes(answer[4:8], "little"))
+        raise AbortedTransfer(int.from_bytes(answer[4:8], "little"))
 
     def send_request(self, data: bytes) -> None:
         """Send an SDO request without waiting for an answer."""
@@ -222,7 +223,7 @@ class Slave:
         return frame.can_id == _SDO_ANSWER + self.node_id
 
     def read(self, index: int, sub: int = 0) -> bytes:
-        """Return the data of an object, by an expedited or a segmented upload. Raises SdoAbort."""
+        """Return the data of an object, by an upload of any kind. Raises AbortedTransfer."""
         where = multiplexer(index, sub)
         answer = self.ask(b"\x40" + where, where)
         if answer[0] & 0xE0 != 0x40 or answer[1:4] != where:
@@ -252,11 +253,11 @@ class Slave:
         return len(variable) // 8
 
     def number(self, index: int, sub: int = 0) -> int:
-        """Return the value of an object as an unsigned number. Raises SdoAbort."""
+        """Return the value of an object as an unsigned number. Raises AbortedTransfer."""
         return int.from_bytes(self.read(index, sub), "little")
 
     def write(self, index: int, sub: int, data: bytes) -> None:
-        """Write 1 to 4 bytes by an expedited download. Raises SdoAbort."""
+        """Write 1 to 4 bytes by an expedited download. Raises AbortedTransfer."""
         command = bytes((0x23 | 4 - len(data) << 2,))
         where = multiplexer(index, sub)
         answer = self.ask(command + where + data, where)
@@ -264,7 +265,7 @@ class Slave:
             raise UnexpectedAnswer(answer)
 
     def write_number(self, index: int, sub: int, value: int) -> None:
-        """Write a value in the size of the object's data type. Raises SdoAbort."""
+        """Write a value in the size of the object's data type. Raises AbortedTransfer."""
         variable = self.variable(index, sub)
         assert variable is not None
         size = len(variable) // 8

@@ -20,7 +20,7 @@ from kontronik_can_gw.dbc.prepare import is_mute, reporter
 from kontronik_can_gw.desk.dbc.canopen_names import pascal_case
 from kontronik_can_gw.desk.describe.markdown import MarkdownTable, Row
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.esc.decoder import EscProtocol, State
+from kontronik_can_gw.esc.decoder import EscProtocol, StateText
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, LinkState
 from kontronik_can_gw.esc.values import VALUES, Divisor, Group, Value
@@ -399,7 +399,7 @@ def _errors(title: str, text: str, protocols: Sequence[EscProtocol]) -> Markdown
     return MarkdownTable(title, [text], rows)
 
 
-def _states(title: str, states: Iterable[tuple[int, str, Text | State]]) -> MarkdownTable:
+def _states(title: str, states: Iterable[tuple[int, str, Text | StateText]]) -> MarkdownTable:
     rows = []
     for value, name, state in states:
         row = {

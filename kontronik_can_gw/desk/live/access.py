@@ -59,7 +59,7 @@ _ENTER = """<!doctype html><html lang="en"><meta charset="utf-8"><title>KONTRONI
 """
 
 
-class Gate:
+class AccessGuard:
     """An ASGI application that passes permitted requests to another one."""
 
     def __init__(self, app: ASGIApp, token: str | None, port: int, names: Iterable[str]) -> None:

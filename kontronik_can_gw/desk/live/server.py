@@ -24,7 +24,7 @@ from starlette.staticfiles import StaticFiles
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from kontronik_can_gw.desk import look
-from kontronik_can_gw.desk.live.access import Gate, is_command, own_names
+from kontronik_can_gw.desk.live.access import AccessGuard, is_command, own_names
 from kontronik_can_gw.desk.live.content import STEPS, Content
 from kontronik_can_gw.desk.live.flights import Flights
 from kontronik_can_gw.desk.sources import Source
@@ -280,7 +280,7 @@ class LiveServer:
         self._hub = hub
         self._sock = sock
         self._flights = flights
-        app = Gate(application(hub, flights), token, sock.getsockname()[1], own_names())
+        app = AccessGuard(application(hub, flights), token, sock.getsockname()[1], own_names())
         self._server = _Server(
             uvicorn.Config(
                 app,

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals.packer import extract, float_of, has_code, place
-from kontronik_can_gw.signals.plan import Layout, MessagePlan, Role, SignalPlan
+from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan, Role, SignalPlan
 
 Value = int | float | str | None
 Chunk = tuple[int, list[Value]]
@@ -102,7 +102,7 @@ class FrameParts(NamedTuple):
 class SignalReader:
     """Decodes the frames of one layout. Its ``columns`` are ordered by message, page and signal."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: MessageLayout) -> None:
         self.layout = layout
         columns: list[Column] = []
         self.parts: list[Part] = []

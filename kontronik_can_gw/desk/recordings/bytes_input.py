@@ -77,13 +77,13 @@ class BytesInput(PlayedInput):
         held = bytearray()
         """Bytes that the decoder has received and that are not part of an entry yet."""
 
-        def hold(pieces: Iterator[bytes]) -> Iterator[bytes]:
+        def note_bytes(pieces: Iterator[bytes]) -> Iterator[bytes]:
             for data in pieces:
                 held.extend(data)
                 yield data
 
         decoder = PROTOCOLS[0].make()
-        for now, reading in self._read_frames(decoder, hold(self.esc_bytes(0))):
+        for now, reading in self._read_frames(decoder, note_bytes(self.esc_bytes(0))):
             size = reading.offset + reading.form.length - given
             yield Entry(now, EntryKind.BYTES, data=bytes(held[:size]))
             del held[:size]

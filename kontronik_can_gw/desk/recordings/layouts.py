@@ -15,7 +15,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
 from kontronik_can_gw.esc.values import VALUES, Group
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -26,7 +26,7 @@ class BusLayout:
     """A DBC as it was read, and the layout compiled from it."""
 
     database: "Database"
-    layout: Layout
+    layout: MessageLayout
     escs: Sequence[EscSettings]
     config: Config | None = None
     """The configuration that names the DBC. None if the DBC was given alone."""

@@ -23,13 +23,13 @@ from kontronik_can_gw.desk.recordings.recording import Input, PlayedBlock, RowBl
 from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native import load
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 
 if TYPE_CHECKING:
     from kontronik_can_gw.desk.recordings.offline import Frames, Rows
     from kontronik_can_gw.desk.recordings.player import Player
 
-NO_MESSAGES = Layout("", "", ())
+NO_MESSAGES = MessageLayout("", "", ())
 
 
 class _RowOutput:

@@ -15,7 +15,7 @@ from kontronik_can_gw.esc.decoder import Counters
 from kontronik_can_gw.native.core import NativeCore
 from kontronik_can_gw.native.header import KCG, structure
 from kontronik_can_gw.native.tables import Places, bind, places_of
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 
 _FRAMES = 1 << 12
 _u32 = c.c_uint32
@@ -156,7 +156,7 @@ class Player(Output):
     def set_bytes(self, period_ns: int) -> None:
         """Prepare for plain bytes: they get a time for each live frame, every ``period_ns``."""
         self._finder = NativeCore(
-            self._library, CoreSettings([self._settings], Layout("", "", ())), 0
+            self._library, CoreSettings([self._settings], MessageLayout("", "", ())), 0
         )
         self._finder.state.mask = 0  # no events
         self._state.finder = self._finder.core

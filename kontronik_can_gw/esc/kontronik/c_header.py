@@ -20,9 +20,9 @@ from kontronik_can_gw.esc.kontronik.codec import (
 from kontronik_can_gw.esc.kontronik.fields import (
     VARIANT_BITS,
     DataType,
+    FieldRow,
     InfoData,
     LiveData,
-    Row,
     body_format,
     rows,
 )
@@ -127,7 +127,7 @@ def _fields(prefix: str, data: DataType, comment: str) -> str:
     return "\n".join([*lines, ""])
 
 
-def _placed(data: DataType) -> Iterator[tuple[int, str, Row]]:
+def _placed(data: DataType) -> Iterator[tuple[int, str, FieldRow]]:
     """Yield each field with its offset after the header."""
     offset = 0
     for name, row in rows(data).items():
@@ -135,7 +135,7 @@ def _placed(data: DataType) -> Iterator[tuple[int, str, Row]]:
         offset += struct.calcsize("<" + row.wire)
 
 
-def _comment(row: Row) -> str:
+def _comment(row: FieldRow) -> str:
     """Return the unit and the note of a row as a comment, or "" if it has neither."""
     words = []
     if row.unit:

@@ -10,8 +10,8 @@ from typing import Annotated, NamedTuple, get_args, get_type_hints
 from kontronik_can_gw.esc.kontronik.states import Device
 
 
-class Row(NamedTuple):
-    """A row of the protocol specification."""
+class FieldRow(NamedTuple):
+    """A row of the sheet."""
 
     wire: str
     """struct code of the wire type."""
@@ -37,22 +37,22 @@ VARIANT_BITS = 10
 """Number of low bits of the info frame's first word that hold the variant."""
 _NOT_JIVEPRO = frozenset({Device.JIVEPRO})
 
-ElectricalSpeed = Annotated[int, Row("I", "1/min")]
-Voltage = Annotated[int, Row("H", "V", 100)]
-Current = Annotated[int, Row("h", "A", 10, note="< 0 regenerates")]
-Charge = Annotated[int, Row("H", "mAh")]
-BecCurrent = Annotated[int, Row("H", "A", 1000, not_on=_NOT_JIVEPRO)]
-BecVoltage = Annotated[int, Row("H", "V", 1000)]
-PwmInput = Annotated[int, Row("H", "µs")]
-Throttle = Annotated[int, Row("b", "%", note="<= 0 brakes")]
-Opening = Annotated[int, Row("B", "%")]
-Temperature = Annotated[int, Row("b", "°C")]
-Word = Annotated[int, Row("I", "", note="a bit for each error")]
-State = Annotated[int, Row("B", "")]
-Timing = Annotated[int, Row("B", "µs")]
-DevicePair = Annotated[int, Row("H", "", note=f"{VARIANT_BITS} low bits: variant")]
-VersionPair = Annotated[int, Row("H", "", note="8 low bits: sub version")]
-Count = Annotated[int, Row("B", "")]
+ElectricalSpeed = Annotated[int, FieldRow("I", "1/min")]
+Voltage = Annotated[int, FieldRow("H", "V", 100)]
+Current = Annotated[int, FieldRow("h", "A", 10, note="< 0 regenerates")]
+Charge = Annotated[int, FieldRow("H", "mAh")]
+BecCurrent = Annotated[int, FieldRow("H", "A", 1000, not_on=_NOT_JIVEPRO)]
+BecVoltage = Annotated[int, FieldRow("H", "V", 1000)]
+PwmInput = Annotated[int, FieldRow("H", "µs")]
+Throttle = Annotated[int, FieldRow("b", "%", note="<= 0 brakes")]
+Opening = Annotated[int, FieldRow("B", "%")]
+Temperature = Annotated[int, FieldRow("b", "°C")]
+Word = Annotated[int, FieldRow("I", "", note="a bit for each error")]
+State = Annotated[int, FieldRow("B", "")]
+Timing = Annotated[int, FieldRow("B", "µs")]
+DevicePair = Annotated[int, FieldRow("H", "", note=f"{VARIANT_BITS} low bits: variant")]
+VersionPair = Annotated[int, FieldRow("H", "", note="8 low bits: sub version")]
+Count = Annotated[int, FieldRow("B", "")]
 
 
 class LiveData(NamedTuple):
@@ -106,7 +106,7 @@ Data = LiveData | InfoData
 DataType = type[LiveData] | type[InfoData]
 
 
-def _rows(data: DataType) -> dict[str, Row]:
+def _rows(data: DataType) -> dict[str, FieldRow]:
     hints = get_type_hints(data, include_extras=True)
     found = {}
     for name in data._fields:
@@ -115,13 +115,13 @@ def _rows(data: DataType) -> dict[str, Row]:
     return found
 
 
-_ROWS: dict[DataType, dict[str, Row]] = {
+_ROWS: dict[DataType, dict[str, FieldRow]] = {
     LiveData: _rows(LiveData),
     InfoData: _rows(InfoData),
 }
 
 
-def rows(data: DataType) -> dict[str, Row]:
+def rows(data: DataType) -> dict[str, FieldRow]:
     """Return the rows of LiveData or InfoData by field name, in wire order."""
     return _ROWS[data]
 

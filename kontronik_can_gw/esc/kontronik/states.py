@@ -6,7 +6,7 @@ Newer firmware may send numbers that have no name here. They are shown as number
 from enum import IntEnum
 from typing import Self
 
-from kontronik_can_gw.esc.decoder import ErrorBit, Severity, State
+from kontronik_can_gw.esc.decoder import ErrorBit, Severity, StateText
 
 
 class Device(IntEnum):
@@ -39,18 +39,18 @@ class OperatingState(IntEnum):
     """Operating state: live frame, offset 32. 0, 4, 5, 6 and 8 have no name.
 
     All recorded idle frames contain 12. A member is written
-    ``NAME = (number, meaning, kind, phase, remedy)``, as described in ``State``. Its name is the
-    spelling of the protocol specification, which describes nothing but the names.
+    ``NAME = (number, meaning, kind, phase, remedy)``, as described in ``StateText``. Its name has
+    the spelling of the sheet, which describes nothing but the names.
     """
 
-    about: State
+    about: StateText
 
     def __new__(
         cls, number: int, meaning: str, kind: str, phase: str, remedy: str = "Nothing to do."
     ) -> Self:
         member = int.__new__(cls, number)
         member._value_ = number
-        member.about = State("", meaning, remedy, kind, phase)
+        member.about = StateText("", meaning, remedy, kind, phase)
         return member
 
     def __init__(self, *_: object) -> None:

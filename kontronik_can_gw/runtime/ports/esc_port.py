@@ -193,7 +193,7 @@ class EscPort:
         """Return True if the loop does not serve this port."""
         return self._stuck.is_stuck(self.port)
 
-    def hold_settings(self) -> None:
+    def restore_settings(self) -> None:
         """Restore the port's settings if another program has changed them.
 
         ``report`` logs the change.

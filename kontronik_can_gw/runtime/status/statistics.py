@@ -72,7 +72,7 @@ def _remove_left_over(folder: Path) -> None:
     """
     for path in folder.glob("*.json"):
         locks = Locks(report=lambda _: None)
-        if not _is_recent(path) and not locks.hold([_lock_name(path)]):
+        if not _is_recent(path) and not locks.lock_only([_lock_name(path)]):
             with contextlib.suppress(OSError):
                 path.unlink()
         locks.close()
@@ -131,7 +131,7 @@ class Statistics:
         self._is_ours = False
         """True if this gateway has written the file."""
         self._locks = Locks()
-        if self._locks.hold([_lock_name(file)]):
+        if self._locks.lock_only([_lock_name(file)]):
             raise RunError(
                 f"statistics.file {file}: another gateway writes it. "
                 "Give each gateway its own file."

@@ -140,12 +140,12 @@ class FaultLog:
         log.log(level, "%s", text)
         self.recent.append(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}")
 
-    def hold(self) -> None:
-        """Hold lines back until ``release``."""
+    def keep_back(self) -> None:
+        """Keep lines back until ``log_kept``."""
         self._held = []
 
-    def release(self) -> None:
-        """Log the lines that were held back."""
+    def log_kept(self) -> None:
+        """Log the lines that were kept back."""
         held = self._held or []
         self._held = None
         for level, text in held:

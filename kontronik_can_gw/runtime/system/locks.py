@@ -80,8 +80,8 @@ class Locks:
         self._reported: set[str] = set()
         self._held: dict[str, tuple[Path, int]] = {}
 
-    def hold(self, names: Iterable[str]) -> list[str]:
-        """Replace the held locks. Returns the names that another gateway holds."""
+    def lock_only(self, names: Iterable[str]) -> list[str]:
+        """Hold exactly these locks from now on. Returns the names that another gateway holds."""
         wanted = dict.fromkeys(names)
         for name in self._held.keys() - wanted.keys():
             path, fd = self._held.pop(name)
@@ -93,7 +93,7 @@ class Locks:
 
     def close(self) -> None:
         """Release all locks."""
-        self.hold(())
+        self.lock_only(())
 
     def _take(self, name: str) -> bool:
         """Acquire one lock. Returns False if another gateway holds it.
@@ -167,7 +167,7 @@ class IdLocks:
         names = names_of(self._gateway, self._config.channel)
         if names == self._names:
             return
-        all_taken = self._locks.hold(names)
+        all_taken = self._locks.lock_only(names)
         self._names = [] if all_taken else names
         for taken in all_taken:
             if at_start:

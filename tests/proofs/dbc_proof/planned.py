@@ -34,7 +34,7 @@ _C_WIRES = {KCG.U8: "B", KCG.I8: "b", KCG.U16: "H", KCG.I16: "h", KCG.U32: "I"}
 _DIVISORS = {
     values.Divisor.ONE: Divisor.ONE,
     values.Divisor.POLE_PAIRS: Divisor.POLES,
-    values.Divisor.OUTPUT: Divisor.OUTPUT,
+    values.Divisor.SHAFT: Divisor.OUTPUT,
     values.Divisor.CELLS: Divisor.CELLS,
 }
 _C_DIVISORS = {

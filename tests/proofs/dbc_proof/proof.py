@@ -28,7 +28,7 @@ from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.native.rows import NotInCore
 from kontronik_can_gw.native.tables import Tables
 from kontronik_can_gw.signals.packer import place
-from kontronik_can_gw.signals.plan import Layout, Piece
+from kontronik_can_gw.signals.plan import MessageLayout, Piece
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -75,7 +75,7 @@ class Proof:
     def __init__(
         self,
         database: "Database",
-        layout: Layout,
+        layout: MessageLayout,
         escs: Sequence[EscSettings],
         settings: DbcConfig,
         quiet_after_ns: int = 0,
