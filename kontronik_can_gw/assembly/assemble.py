@@ -226,10 +226,8 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     if problems:
         raise UserError(*problems)
     load_warning = _load_warning(config, dbc.layout, configured)
-    message_ids = {}
-    for message in dbc.layout.messages:
-        if not message.extended:
-            message_ids[message.can_id] = message.name
+    messages = dbc.layout.messages
+    message_ids = {each.can_id: each.name for each in messages if not each.extended}
     outputs = [setup.fitted(message_ids) for setup in outputs]
     warnings: list[str] = []
     if outputs != configured:
@@ -240,10 +238,8 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     for fitted in outputs:
         warnings += fitted.warnings(config.file, config.can.bitrate)
         damaged += fitted.faults
-    mute = unreported(dbc.layout, config.dbc.silent_on_loss)
-    mute += unsupplied(dbc.layout, escs)
-    if config.can.quiet_after_s:
-        mute += without_quiet(dbc.layout)
+    settings = core_settings(escs, dbc.layout, config)
+    mute = unreported(settings) + unsupplied(settings) + without_quiet(settings)
     return Loaded(
         config=config,
         escs=escs,

@@ -212,10 +212,12 @@ class CanopenSetup(OutputSetup):
         for cob_id, users_of_id in users.items():
             is_shared = len(users_of_id) > 1 and any(use.own for _, use in users_of_id)
             if is_shared or cob_id in message_ids:
-                clashing.update(number for number, _ in users_of_id)
-        for number, settings in enumerate(self.settings):
-            if settings.read_only and self.stored[number].node_id == UNCONFIGURED:
-                clashing.add(number)
+                clashing.update(dict(users_of_id))
+        clashing.update(
+            number
+            for number, stored in enumerate(self.stored)
+            if stored.node_id == UNCONFIGURED and self.settings[number].read_only
+        )
         return clashing
 
     # --- for people

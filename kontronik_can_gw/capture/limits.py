@@ -78,9 +78,8 @@ def check_state(state: Mapping[str, Any]) -> None:
         _check_numbers(place, _LIMITS_OF_PLACE)
     if "counters" in state:
         check_counters([whole_number(each, 0, END_OF_TIME) for each in state["counters"]])
-    for name, high in _LIMITS_OF_GATEWAY.items():
-        if name in state:
-            whole_number(state[name], 0, high)
+    for name in _LIMITS_OF_GATEWAY.keys() & state.keys():
+        whole_number(state[name], 0, _LIMITS_OF_GATEWAY[name])
 
 
 def _check_numbers(numbers: Sequence[Any], limits: Sequence[tuple[int, int]]) -> None:

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import tomllib
 from collections.abc import Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -168,9 +169,9 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
     layout = loaded.layout
     can = config.can
     load = layout.bus_load(can.bitrate, can.data_bitrate)
-    frames = sum(message.rate_hz for message in layout.messages)
+    frames = sum(map(attrgetter("rate_hz"), layout.messages))
     worst = layout.bus_load(can.bitrate, can.data_bitrate, is_worst=True)
-    worst_frames = sum(message.worst_rate_hz for message in layout.messages)
+    worst_frames = sum(map(attrgetter("worst_rate_hz"), layout.messages))
     for output in loaded.outputs:
         more, bits = output.traffic()
         load += bits / can.bitrate

@@ -84,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
         raise UserError(f"--node {args.node}: a node-ID is a number from 1 to 127")
     items = chosen_items(args.only)
     reasons = args.deviations or (None if args.eds else GATEWAY_DEVIATIONS)
-    deviations = read_deviations(None if reasons is None else Path(reasons))
+    deviations = read_deviations(reasons)
     path = Path(args.eds) if args.eds else Path(str(shipped("eds/kontronik_esc.eds")))
     for output in filter(None, (args.output, args.junit)):
         check_output(output, [path], force=args.force)

@@ -116,11 +116,12 @@ def main(args: argparse.Namespace) -> int:
     if root is None and os.geteuid() != 0:
         command = f"sudo {_own_program()} service {args.action}"
         raise RunError(f"service {args.action}: needs root. Type {command} with the same options.")
+    top = root or Path("/")
     try:
         if args.action == "install":
-            _install(args, root or Path("/"))
+            _install(args, top)
         else:
-            _uninstall(root or Path("/"), staged=root is not None)
+            _uninstall(top, staged=root is not None)
     except OSError as error:
         raise RunError(f"{error.filename}: {error.strerror}") from None
     return 0
@@ -305,8 +306,9 @@ def _is_accessible(path: Path) -> bool:
 def _uninstall(root: Path, *, staged: bool) -> None:
     """Stop, disable and remove the services. Configurations, parameters and the user are kept."""
     if not staged:
-        for verb in ("stop", "reset-failed"):
-            _call("systemctl", verb, f"{NAME}*.path", f"{NAME}*.service")
+        units = (f"{NAME}*.path", f"{NAME}*.service")
+        _call("systemctl", "stop", *units)
+        _call("systemctl", "reset-failed", *units)
     found = [path for path in (root / _WANTS).glob(f"{NAME}*") if path.is_symlink()]
     found += _obsolete_files(root)
     for place, text in planned(""):

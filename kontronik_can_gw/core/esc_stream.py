@@ -118,16 +118,15 @@ class EscStream(EscTelemetry):
         if arrivals and now - arrivals[0][1] > timeout:
             self.late_frames += len(decoder.flush())
             arrivals.clear()
-        bound = since + (len(data) - 1) * byte_ns
-        if bound > now:  # a pseudo terminal is faster than the wire
-            bound = now
+        # A pseudo terminal is faster than the wire.
+        bound = min(since + (len(data) - 1) * byte_ns, now)
         readings = decoder.feed(data, now)
         end = decoder.counters.bytes
         if pending := decoder.pending:
             arrivals.append((end, bound))
             while arrivals[0][0] <= end - pending:
                 arrivals.popleft()
-        elif arrivals:
+        else:
             arrivals.clear()
         shown = bound
         if now - bound <= self._interval_ns:
@@ -207,16 +206,13 @@ class EscStream(EscTelemetry):
             events = Event.INFO | Event.LINK
         if form.is_info:
             return events | self._accept_info(data, when, bound)
-        if reading.is_suspect:
-            self.suspect_frames += 1
+        self.suspect_frames += reading.is_suspect
         live = self.live
         before = self.live_ns
         if before is not None:
             # Neither time moves backwards.
-            if when < before:
-                when = before
-            if bound < self.live_bound_ns:
-                bound = self.live_bound_ns
+            when = max(when, before)
+            bound = max(bound, self.live_bound_ns)
             if live is not None:
                 self._integrate(live, when - before)
         word = self._errors_word

@@ -15,7 +15,7 @@ from kontronik_can_gw.core.output import Owner
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group
-from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.signals.packer import alive_modulus, compile_frame
 from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan, Role, SendType
 from kontronik_can_gw.status import GatewayStatus
@@ -41,27 +41,24 @@ class Traits:
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         self.is_paged = len(plan.pages) > 1
-        # Without a cycle, a minimum delay time and further groups, time never makes it pending.
-        self.is_untimed = not (plan.cycle_ns or plan.delay_ns or self.is_paged)
-        # Messages with the state of the link are always sent.
-        self.is_silent_on_loss = (
-            settings.silent_on_loss
-            and bool(plan.paces & {Group.LIVE, Group.INFO})
-            and Group.LINK not in plan.paces
-        )
-        has_events = self.by_event or self.on_change
-        self.follows_gateway = Group.GATEWAY in plan.paces and has_events
-        roles = {signal.role: signal for signal in plan.compiled}
-        alive = roles.get(Role.ALIVE)
-        self.alive_modulus = 0 if alive is None else alive_modulus(alive, plan.e2e)
+        # Without a cycle, a minimum distance and further pages, time never makes it pending.
+        self.is_untimed = not any((plan.cycle_ns, plan.delay_ns, self.is_paged))
+        self.is_silent_on_loss = settings.silent_on_loss and plan.can_stop
+        counters = [signal for signal in plan.compiled if signal.role is Role.ALIVE]
+        self.alive_modulus = 0
+        for counter in counters:
+            self.alive_modulus = alive_modulus(counter, plan.e2e)
         self.triggers = Event.NONE
-        if has_events:
-            for pace in plan.paces:
-                self.triggers |= _EVENT_OF_PACE[pace]
-            by_live_frames = self.by_event and self.triggers & Event.LIVE
-            if self.triggers & Event.LINK and not (plan.cycle_ns or by_live_frames):
-                # Counters, rates and ages change without an event. Nothing else sends the message.
-                self.triggers |= Event.SECOND
+        self.follows_gateway = False
+        if not (self.by_event or self.on_change):
+            return
+        self.follows_gateway = Group.GATEWAY in plan.paces
+        for pace in plan.paces:
+            self.triggers |= _EVENT_OF_PACE[pace]
+        by_live_frames = self.by_event and self.triggers & Event.LIVE
+        if self.triggers & Event.LINK and not (plan.cycle_ns or by_live_frames):
+            # Counters, rates and ages change without an event. Nothing else sends the message.
+            self.triggers |= Event.SECOND
 
 
 def phases(cycles: Sequence[int]) -> list[int]:
@@ -216,10 +213,7 @@ def own_ids(layout: MessageLayout) -> dict[int, Owner]:
     """Return the ids of the messages (with EXTENDED if they have 29 bits) and their owners."""
     owners = {}
     for plan in layout.messages:
-        key = plan.can_id
-        if plan.extended:
-            key |= EXTENDED
-        owners[key] = Owner(None, f"message {plan.name}")
+        owners[plan.key] = Owner(None, f"message {plan.name}")
     return owners
 
 

@@ -164,8 +164,8 @@ class _Multiplexing:
 def _numbers(text: str) -> _Numbers:
     """Yield each number with its kind and its place."""
     for found in _POWER.finditer(text):
-        exponent = found[1].replace("_", "") or "0"
-        yield "exponent", int(exponent), f"line {_line(text, found)}: "
+        exponent = found[1].replace("_", "")
+        yield "exponent", int("0" + exponent), f"line {_line(text, found)}: "
     for found in _NODE_LIST.finditer(text):
         yield "number of nodes", len(found[1].split()), ""
     messages: defaultdict[int, list[_Multiplexing]] = defaultdict(list)

@@ -57,7 +57,7 @@ def profile_of(message: "Message", database: "Database") -> Profile | None:
     ((attribute_name, text),) = stated
     match = _PROFILE_TEXT.fullmatch(normalize(str(text)))
     name = match[1] + match[2].upper() if match else ""
-    profile = PROFILES.get("1A" if name == "1" else name)
+    profile = (PROFILES | {"1": PROFILES["1A"]}).get(name)
     if profile is None:
         known = ", ".join(PROFILES)
         raise UnclearAttribute(

@@ -134,9 +134,7 @@ class Binder:
         candidates.append((None, key))
         for candidate, rest in candidates:
             known = VALUES_BY_KEY if candidate is None else self._known[candidate]
-            value = known.get(rest)
-            if value is None:
-                value = known.get(rest.removesuffix("percent"))
+            value = known.get(rest, known.get(rest.removesuffix("percent")))
             if value is None:
                 continue
             if value.group is Group.GATEWAY:

@@ -12,9 +12,10 @@ without Quiet, and values that a protocol does not supply.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.message_compiler import compile_message
@@ -24,7 +25,7 @@ from kontronik_can_gw.dbc.reader import choose_node, listed, own_left_out
 from kontronik_can_gw.dbc.signal_compiler import Compilation
 from kontronik_can_gw.errors import UserError, did_you_mean
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.esc.values import VALUES, Group, Value
 from kontronik_can_gw.frames import block_of
 from kontronik_can_gw.signals.packer import has_code
 from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan, SignalPlan
@@ -239,34 +240,30 @@ def is_mute(signal: SignalPlan) -> bool:
 
 def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
     """Return the signal in the frame of a flag that reports lost telemetry. None without it."""
+    group = cast(Value, flag.source).group
     for signal in message.signals:
         source = signal.source
         is_in_frame = signal.page in (None, flag.page)
         if source is None or not is_in_frame or signal.esc != flag.esc:
             continue
-        assert flag.source is not None
-        if source.name in _OF_LINK and flag.source.group is Group.LIVE:
+        if source.name in _OF_LINK and group is Group.LIVE:
             return signal
-        if source.group is flag.source.group and not source.optional and has_code(signal):
+        if source.group is group and not source.optional and has_code(signal):
             return signal
     return None
 
 
-def unreported(layout: MessageLayout, silent_on_loss: bool) -> list[str]:
-    """Return a warning for each message whose flags hide the loss of telemetry.
-
-    ``silent_on_loss`` is True if ``dbc.on_loss`` is "silent".
-    """
+def unreported(settings: CoreSettings) -> list[str]:
+    """Return a warning for each message whose flags hide the loss of telemetry."""
+    layout = settings.layout
     found = []
     for message in layout.messages:
-        has_telemetry = not message.paces.isdisjoint({Group.LIVE, Group.INFO})
-        stops = has_telemetry and Group.LINK not in message.paces
         flags = []
         for signal in message.signals:
             if is_mute(signal) and reporter(message, signal) is None:
                 flags.append(signal.name)
-        if flags and not (silent_on_loss and stops):
-            remedy = ', or set dbc.on_loss = "silent"' if stops else ""
+        if flags and not (settings.silent_on_loss and message.can_stop):
+            remedy = ', or set dbc.on_loss = "silent"' if message.can_stop else ""
             found.append(
                 f"{layout.file}: {message.name}: without telemetry {listed(flags, 3)} are sent "
                 "as if they were known, and no signal "
@@ -276,10 +273,12 @@ def unreported(layout: MessageLayout, silent_on_loss: bool) -> list[str]:
     return found
 
 
-def without_quiet(layout: MessageLayout) -> list[str]:
-    """Return a warning for each signal that cannot report quiet mode."""
+def without_quiet(settings: CoreSettings) -> list[str]:
+    """Return a warning for each signal that cannot report quiet mode, if this mode can begin."""
+    layout = settings.layout
+    messages = layout.messages if settings.quiet_after_ns else ()
     found = []
-    for message in layout.messages:
+    for message in messages:
         for signal in message.signals:
             numbers = signal.numbers
             is_state = signal.source is VALUES["gateway_state"]
@@ -291,8 +290,9 @@ def without_quiet(layout: MessageLayout) -> list[str]:
     return found
 
 
-def unsupplied(layout: MessageLayout, escs: Sequence[EscSettings]) -> list[str]:
+def unsupplied(settings: CoreSettings) -> list[str]:
     """Return a warning for each message with values that its ESC's protocol does not have."""
+    layout = settings.layout
     found = []
     for message in layout.messages:
         names = []
@@ -300,7 +300,7 @@ def unsupplied(layout: MessageLayout, escs: Sequence[EscSettings]) -> list[str]:
         for signal in message.signals:
             if signal.source is not None and not signal.source.supplied:
                 names.append(signal.name)
-                protocols.add(escs[signal.esc or 0].protocol)
+                protocols.add(settings.escs[signal.esc or 0].protocol)
         if names:
             found.append(
                 f"{layout.file}: {message.name}: {listed(names, 3)}: "

@@ -312,7 +312,7 @@ class _Rewriting:
             entry = f"{keyword} {name}"
             if number is not None:
                 entry = f"{keyword} {number} {name}"
-                key = (number.lstrip("0") or "0", name)
+                key = (str(int(number)), name)
                 if key not in signals and key[0] in self._left_out_numbers:
                     return "\n" * found[0].count("\n")
                 if key not in signals:

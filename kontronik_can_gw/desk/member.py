@@ -200,8 +200,8 @@ class Member:
         names = {int(bit): bit for bit in self.protocol.errors.get(word, ())}
         named = [bit for bit in names.values() if number >> bit & 1]
         unnamed = []
-        for position in range(32):
-            if number >> position & 1 and position not in names:
+        for position in sorted({*range(32)} - names.keys()):
+            if number >> position & 1:
                 meaning = f"bit {position} of {word}, without a name"
                 unnamed.append(Flag(f"bit{position}", Severity.WARNING, meaning))
         if not number and not has_other_values:

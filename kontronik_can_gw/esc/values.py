@@ -272,8 +272,8 @@ def _derived_values(live: Mapping[str, Value]) -> Iterator[Value]:
             divisor=Divisor.SHAFT,
         )
     if voltage is not None and current is not None:
-        voltages = (voltage.low or 0, voltage.high or 0)
-        currents = (current.low or 0, current.high or 0)
+        voltages: Any = (voltage.low, voltage.high)  # a field of the wire has limits
+        currents: Any = (current.low, current.high)
         products = [u * i for u in voltages for i in currents]
         yield Value(
             name="battery_power",

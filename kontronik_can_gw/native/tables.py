@@ -15,7 +15,6 @@ from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
-from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import (
     COUNTS,
@@ -167,11 +166,8 @@ class Tables:
                 self._add_signal(signal, plan)
         first_esc = len(self.esc_of)
         self.esc_of += sorted(plan.escs)
-        key = plan.can_id
-        if plan.extended:
-            key |= EXTENDED
         row = Message(
-            id=key,
+            id=plan.key,
             length=plan.length,
             words=words,
             flags=flags,

@@ -85,8 +85,13 @@ class Turns:
         """Watch nothing any more."""
         self.watch(())
 
-    def add_output_frames(self, frames: Sequence[CanFrame]) -> bool:
-        """Queue frames of outputs before the core's. Return False if the loop must send them."""
+    def add_output_frames(self, frames: list[CanFrame]) -> bool:
+        """Move frames of outputs into the queue, before the core's.
+
+        Return False, without moving them, if the loop must send them.
+        """
+        if not frames:
+            return True
         queue = self._queue
         raw = self._raw
         waiting = queue.count
@@ -107,6 +112,7 @@ class Turns:
         queue.count = count
         queue.from_outputs = count
         self.result.taken += len(frames)
+        frames.clear()
         return True
 
     @property

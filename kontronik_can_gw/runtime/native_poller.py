@@ -96,7 +96,7 @@ class NativePoller(Poller):
             return False
         if port.state is not gateway.status.can_state or can.controller.is_off:
             return False
-        return can.is_proven and can.transmitter.is_idle and self._watch_descriptors()
+        return can.transmitter.is_idle and self._watch_descriptors()
 
     def run(self, can: "CanLink", due: int, leave: int, period: int) -> Work:
         """Run iterations in C until there is work for the loop. ``can_run`` must be true.
@@ -176,17 +176,13 @@ class NativePoller(Poller):
             core.dispatch(event, now)
         if core.link_changes or core.reports_live or gateway.revision != revision:
             return False
-        if not is_due and event & Event.QUIET:  # the gate follows it
+        if event & Event.QUIET:  # the gate follows it
             return False
         request.outputs_due = gateway.next_deadline(with_core=False)
         request.due = min(request.due, core.deadline_in_python())
         if now >= request.due or (is_due and now >= request.outputs_due):
             return False
-        if frames := gateway.output_frames:
-            if not turns.add_output_frames(frames):
-                return False
-            frames.clear()
-        return True
+        return turns.add_output_frames(gateway.output_frames)
 
     def _watch_descriptors(self) -> bool:
         """Let C watch the descriptors. Return False if that is impossible."""

@@ -146,7 +146,7 @@ def raw_value(
             return raw % (signal.high + 1)
         if not signal.low <= raw <= signal.high:
             return signal.low if signal.saturates and raw < signal.low else signal.error
-    return signal.error if raw is None or raw == signal.not_available else raw
+    return signal.error if raw in (None, signal.not_available) else raw
 
 
 def _float_raw(signal: SignalPlan, count: int, parts: tuple[int, int]) -> int | None:

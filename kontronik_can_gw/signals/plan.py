@@ -149,6 +149,20 @@ class MessagePlan:
     """For a copy for another ESC: prefix of the signals' names in ``compiled``, and prefix here."""
 
     @property
+    def key(self) -> int:
+        """The id, with ``EXTENDED`` if it has 29 bits."""
+        return self.can_id | EXTENDED if self.extended else self.can_id
+
+    @property
+    def can_stop(self) -> bool:
+        """True if it stops while telemetry is lost, if ``dbc.on_loss`` is "silent".
+
+        Messages with the state of the link are always sent.
+        """
+        has_telemetry = not self.paces.isdisjoint({Group.LIVE, Group.INFO})
+        return has_telemetry and Group.LINK not in self.paces
+
+    @property
     def signals(self) -> tuple[SignalPlan, ...]:
         """The signals of this message.
 
@@ -227,8 +241,7 @@ class MessageLayout:
         found = {}
         for message in self.messages:
             if message.e2e is not None:
-                can_id = message.can_id | (EXTENDED if message.extended else 0)
-                found[can_id] = message.e2e.data_ids
+                found[message.key] = message.e2e.data_ids
         return found
 
     @cached_property

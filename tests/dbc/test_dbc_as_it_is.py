@@ -18,6 +18,7 @@ from packer_oracle import UNITS
 
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.config.output_keys import DbcConfig
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.dbc.names import protection
 from kontronik_can_gw.dbc.prepare import is_mute, reporter, unreported
 from kontronik_can_gw.dbc.reader import parse_database
@@ -467,16 +468,16 @@ def test_a_layout_without_a_signal_that_reports_the_loss_causes_a_warning(
     found = reporter(message, flag)
     assert is_mute(flag)
     assert (found.name if found else None) == name
-    warned = unreported(layout, silent_on_loss=False)
+    warned = unreported(CoreSettings((), layout))
     assert len(warned) == (name is None)
     assert all('on_loss = "silent"' in line and "Undervoltage" in line for line in warned)
-    assert not unreported(layout, silent_on_loss=True)
+    assert not unreported(CoreSettings((), layout, silent_on_loss=True))
 
 
 def test_each_flag_needs_a_signal_of_its_own_esc_to_report_the_loss() -> None:
     text = MESSAGE + signal("LeftUndervoltage", "0|1@1+") + signal("RightUndervoltage", "1|1@1+")
     layout = compiled(text + signal("LeftLinkState", "8|8@1+"), ("left", "right"))
-    (line,) = unreported(layout, silent_on_loss=False)
+    (line,) = unreported(CoreSettings((), layout))
     assert "RightUndervoltage" in line
     assert "LeftUndervoltage" not in line
 

@@ -82,7 +82,7 @@ def clean_toml(text: str, part: str, cleaner: Cleaner) -> str:
         elif entry is not None:
             value = line[entry.end() :].strip(" \t\r#")
             is_harmless = _is_harmless(table_name, entry["key"], value)
-            is_hidden = is_hidden_table or is_secret_name(entry["key"]) or not is_harmless
+            is_hidden = is_hidden_table or not is_harmless
             if is_hidden:
                 cleaner.count(part, entry["key"].strip())
                 lines.append(f'{entry[0]} "{REMOVED}"')
@@ -95,7 +95,12 @@ def clean_toml(text: str, part: str, cleaner: Cleaner) -> str:
 
 
 def _is_harmless(table: str, key: str, value: str) -> bool:
-    """Return True for a key of the configuration, and for a value that cannot be a secret."""
+    """Return True for a key of the configuration, and for a value that cannot be a secret.
+
+    A key with the name of a secret is never harmless.
+    """
+    if is_secret_name(key):
+        return False
     path = [part.strip(" \t\"'") for part in f"{table}.{key}".strip(".").split(".")]
     rows = () if path[0] not in TABLES else [row.name for row in fields(TABLES[path[0]])]
     if len(path) > 1:

@@ -72,7 +72,7 @@ GATEWAY_DEVIATIONS = Path(__file__).with_name("gateway_deviations.toml")
 """Deliberate deviations of the gateway's nodes."""
 
 
-def read_deviations(path: Path | None) -> dict[str, str]:
+def read_deviations(path: str | Path | None) -> dict[str, str]:
     """Return the reasons of deliberate deviations by the name of the item.
 
     The file is TOML with lines such as ``od-vendor-id-is-assigned = "only CiA assigns one"``.
@@ -81,7 +81,7 @@ def read_deviations(path: Path | None) -> dict[str, str]:
     if path is None:
         return {}
     try:
-        found = tomllib.loads(path.read_text(encoding="utf-8"))
+        found = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}.") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

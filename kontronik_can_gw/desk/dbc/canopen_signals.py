@@ -93,8 +93,8 @@ def signals_of(
         return [signal]
     if not place.is_float:
         signal.limits = (low * signal.factor, high * signal.factor)
-    is_unsigned_word = place.length == 16 and not place.signed
-    if (entry.index, entry.sub) == (at.ERROR_CODE, 0) and is_unsigned_word:
+    shape = (place.length, place.signed)
+    if (entry.index, entry.sub, *shape) == (at.ERROR_CODE, 0, 16, False):
         signal.texts = emergency_names(protocol.errors.get("operating_errors", ()))
     return [signal]
 

@@ -177,7 +177,7 @@ def _message(sent: Copy, data_ids: Sequence[int] | None = None) -> MessageRow:
     message = sent.message
     multiplexers = sum(signal.is_multiplexer for signal in message.signals)
     pages = [len(signal.multiplexer_ids or ()) for signal in message.signals]
-    in_pages = multiplexers > 1 or max(pages, default=0) > 1
+    in_pages = max([multiplexers, *pages]) > 1
     signals = []
     for signal, name in sent.signals():
         signals.append(_signal(signal, name, sent.prefix, in_pages))
@@ -215,8 +215,7 @@ def _signal(
     """
     pages = signal.multiplexer_ids or ()
     multiplexing = f"m{pages[0]}" if pages else ""
-    if signal.is_multiplexer:
-        multiplexing += "M"
+    multiplexing += "M" * signal.is_multiplexer
     page_ranges = ""
     if in_pages and pages:
         ranges = ", ".join(f"{page}-{page}" for page in pages)
@@ -367,7 +366,6 @@ def _relations(database: "Database", sent: Sequence[Copy]) -> Iterator[str]:
     relations = dbc.relation_attributes
     if relations is None:
         return
-    found: list[tuple[str, Any]] = []
     copies: dict[int, list[Copy]] = {}
     for each in sent:
         copies.setdefault(Copy(each.message).key, []).append(each)
@@ -376,12 +374,14 @@ def _relations(database: "Database", sent: Sequence[Copy]) -> Iterator[str]:
             for signal, by_node in by_signal.items():
                 target = f"SG_ {each.key} {each.prefix + signal}"
                 for node, attributes in by_node.items():
-                    found.append((f"BU_SG_REL_ {node} {target}", attributes))
+                    yield from _relation(f"BU_SG_REL_ {node} {target}", attributes)
     for number, by_node in relations.node_message_relations.items():
         for each in copies.get(number, ()):
             for node, attributes in by_node.items():
-                found.append((f"BU_BO_REL_ {node} {each.key}", attributes))
-    for owner, attributes in found:
-        for attribute in attributes.values():
-            value = _value(attribute.value, attribute.definition)
-            yield f'BA_REL_ "{attribute.name}" {owner} {value};'
+                yield from _relation(f"BU_BO_REL_ {node} {each.key}", attributes)
+
+
+def _relation(owner: str, attributes: Mapping[str, Any]) -> Iterator[str]:
+    for attribute in attributes.values():
+        value = _value(attribute.value, attribute.definition)
+        yield f'BA_REL_ "{attribute.name}" {owner} {value};'

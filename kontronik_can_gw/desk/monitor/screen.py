@@ -281,11 +281,7 @@ def _histories(escs: Sequence[Esc], width: int, height: int, largest: int) -> li
     if chart_lines < len(known) * len(escs):
         chart_lines = largest - 2
     count = max(0, chart_lines) // max(1, len(escs))
-    charts: list[tuple[Quantity, Esc]] = []
-    for quantity in known[:count]:
-        for esc in escs:
-            if esc.has(quantity.source):
-                charts.append((quantity, esc))
+    charts = [(each, esc) for each in known[:count] for esc in escs if esc.has(each.source)]
     names = max(len(esc.name) for esc in escs)
     widths = (names, *_HISTORY_WIDTHS)
     seconds = min(HISTORY_S, width - sum(widths) - len(widths))

@@ -12,10 +12,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from kontronik_can_gw.esc.values import Group
-from kontronik_can_gw.frames import EXTENDED
 from kontronik_can_gw.signals.packer import extract, float_of, has_code, place
 from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan, Role, SignalPlan
 
@@ -109,9 +108,7 @@ class SignalReader:
         self.messages: dict[int, FrameParts] = {}
         """The layout's messages by CAN id, with ``EXTENDED`` for ids of 29 bits."""
         for plan in layout.messages:
-            key = plan.can_id
-            if plan.extended:
-                key |= EXTENDED
+            key = plan.key
             all_signals = plan.signals
             part_of_page: dict[int | None, int] = {}
             for page in dict.fromkeys((None, *plan.pages)):
@@ -123,19 +120,11 @@ class SignalReader:
                 part = Part(len(columns), len(signals), plan, page, unpacker)
                 self.parts.append(part)
                 columns += [_column(signal, plan, key) for signal in signals]
-            page_of = None
-            for signal in all_signals:
-                if signal.role is Role.MULTIPLEXER:
-                    page_of = partial(extract, signal.pieces)
-                    break
-            common = []
-            paged = {}
-            for page, index in part_of_page.items():
-                if page is None:
-                    common.append(index)
-                else:
-                    paged[page] = index
-            self.messages[key] = FrameParts(plan.length, tuple(common), paged, page_of)
+            multiplexers = (s for s in all_signals if s.role is Role.MULTIPLEXER)
+            page_of = next((partial(extract, each.pieces) for each in multiplexers), None)
+            paged: Any = part_of_page.copy()
+            common = (paged.pop(None),) if None in paged else ()
+            self.messages[key] = FrameParts(plan.length, common, paged, page_of)
         self.columns = tuple(columns)
 
     @property

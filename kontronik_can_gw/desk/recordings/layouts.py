@@ -13,8 +13,8 @@ from kontronik_can_gw.dbc.expand import copies_of
 from kontronik_can_gw.dbc.reader import choose_node, load_database
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.value_names import normalize
-from kontronik_can_gw.esc.values import VALUES, Group
+from kontronik_can_gw.esc.value_names import VALUES_BY_KEY, normalize
+from kontronik_can_gw.esc.values import Group
 from kontronik_can_gw.signals.plan import MessageLayout
 
 if TYPE_CHECKING:
@@ -94,19 +94,16 @@ def esc_names(database: "Database", node: str) -> list[str]:
 
     They have the order of the messages. Empty for a DBC of one ESC.
     """
-    all_values = set()
-    values_of_escs = set()
-    for name, value in VALUES.items():
-        all_values.add(normalize(name))
-        if value.group is not Group.GATEWAY:
-            values_of_escs.add(normalize(name))
+    values_of_escs = [
+        name for name, value in VALUES_BY_KEY.items() if value.group is not Group.GATEWAY
+    ]
     counts: Counter[str] = Counter()
     for message in database.messages:
         if node not in message.senders:
             continue
         for signal in message.signals:
             key = normalize(signal.name).removesuffix("percent")
-            if key in all_values:
+            if key in VALUES_BY_KEY:
                 continue
             endings = [name for name in values_of_escs if key.endswith(name)]
             ending = max(endings, key=len, default="")

@@ -25,6 +25,7 @@ from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.frames import EXTENDED
+from kontronik_can_gw.printable import counted
 from kontronik_can_gw.times import SECOND
 
 _BATCH = 256
@@ -178,15 +179,15 @@ class CanLogInput(Input):
                 if item.channel != before:
                     before = item.channel
                     self._channels[before] = None
-                if selected is None or item.channel == selected:
+                if selected in (None, item.channel):
                     yield item
         except OSError as error:
             raise RunError(f"{self._path}: cannot be read: {error.strerror}.") from None
         self.damage = [*self._reader.damage]
         if clock.impossible:
-            plural = "s" if clock.impossible > 1 else ""
-            self.damage.append(f"{clock.impossible} frame{plural} with an impossible time left out")
-        if self._channels and selected is not None and selected not in self._channels:
+            frames = counted(clock.impossible, "frame")
+            self.damage.append(f"{frames} with an impossible time left out")
+        if self._channels and selected not in (None, *self._channels):
             listed = ", ".join(sorted(self._channels))
             raise UserError(f"{self._path}: has no channel {selected}. Available: {listed}.")
 

@@ -119,8 +119,8 @@ def open_stream(path: Path) -> Stream | None:
     are not opened, because a device may be the port of an ESC.
     """
     if is_standard_input(path):
-        mode = os.fstat(0).st_mode
-        if stat.S_ISCHR(mode) or stat.S_ISBLK(mode) or stat.S_ISDIR(mode):
+        kind = stat.S_IFMT(os.fstat(0).st_mode)
+        if kind in (stat.S_IFCHR, stat.S_IFBLK, stat.S_IFDIR):
             raise UserError(
                 f"{name_of(path)}: is a terminal or another device. "
                 "Send the data through a pipe: COMMAND | kontronik-can-gw …"

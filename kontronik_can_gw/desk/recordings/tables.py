@@ -241,9 +241,8 @@ class ParquetTable:
         self._texts = []
         """Numbers and texts of each column. Empty for a column without texts."""
         for one in table.fields:
-            numbers = [number for number, _ in one.texts]
-            texts = [text for _, text in one.texts]
-            pair = (pa.array(numbers, pa.int64()), pa.array(texts, pa.string()))
+            texts = dict(one.texts)
+            pair = (pa.array([*texts], pa.int64()), pa.array([*texts.values()], pa.string()))
             self._texts.append(pair)
         heads = [pa.field(f"{TIME} [s]", pa.float64(), metadata={"unit": "s"})]
         if table.has_utc:

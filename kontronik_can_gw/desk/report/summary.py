@@ -78,10 +78,10 @@ def tables(flight: Flight) -> str:
     for title, labels in of_escs[0].items():
         rows = ""
         for label in labels:
-            values = [groups[title][label] for groups in of_escs]
-            if any(values):
-                cells = "".join(f"<td>{value or '–'}</td>" for value in values)
-                rows += f'<tr><th scope="row">{label}</th>{cells}</tr>'
+            values = [groups[title][label] or "–" for groups in of_escs]
+            if {*values} != {"–"}:
+                cells = "</td><td>".join(values)
+                rows += f'<tr><th scope="row">{label}</th><td>{cells}</td></tr>'
         if rows:
             caption = f"<caption>{title}</caption>"
             html += f'<table class="numbers">{caption}{head}<tbody>{rows}</tbody></table>'

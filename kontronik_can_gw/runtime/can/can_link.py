@@ -92,11 +92,6 @@ class CanLink:
         return due
 
     @property
-    def is_proven(self) -> bool:
-        """True if the interface has sent a frame since its last failure."""
-        return self.gate.has_proof
-
-    @property
     def is_open(self) -> bool:
         return self.port is not None
 

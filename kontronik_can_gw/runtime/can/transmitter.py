@@ -128,13 +128,11 @@ class Transmitter:
         if port is None or gate.is_off:
             return None
         if gateway.is_held:
-            # Frames that are released now are sent in the next iteration, at once, as in a replay.
-            return self._send_first_frame(port, now) if gate.wants_first_frame(now) else None
+            # Frames that are released now are sent in the next turn, at once, as in a replay.
+            return self._send_first_frame(port, now)
         if gate.is_limited:
             return self._send_limited(port, now)
-        frames = gateway.take_frames(now)
-        if frames:
-            self.put(frames)
+        self.put(gateway.take_frames(now))
         if not gate.may_try(now):
             return None
         return self._send(port, None, now)
@@ -198,6 +196,8 @@ class Transmitter:
 
     def _send_first_frame(self, port: CanPort, now: int) -> Sent | None:
         gate = self.gate
+        if not gate.wants_first_frame(now):
+            return None
         frame = self._gateway.first_frame(now)
         if frame is None:
             gate.no_first_frame(now)

@@ -468,11 +468,11 @@ def remove_oldest(folder: Path, keep_bytes: int, spared: Path | None = None) -> 
     if not keep_bytes:
         return
     found: list[tuple[int, str, int, Path]] = []
-    for path in folder.iterdir():
+    for entry in os.scandir(folder):
         with contextlib.suppress(FileNotFoundError):  # another gateway has removed it
-            if _OURS.fullmatch(path.name) and not path.is_symlink() and path.is_file():
-                status = path.stat()
-                found.append((status.st_mtime_ns, path.name, status.st_size, path))
+            if _OURS.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+                status = entry.stat()
+                found.append((status.st_mtime_ns, entry.name, status.st_size, Path(entry.path)))
     total = sum(size for _, _, size, _ in found)
     for _, _, size, path in sorted(found):
         if total <= keep_bytes:

@@ -9,6 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
+from types import MappingProxyType
 from typing import IO, TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.desk.recordings.can_logs.channels import Channels
@@ -43,7 +44,7 @@ class CanLogWriter:
         wall_ns: int | None,
         origin_ns: int = 0,
         channel: str = "can0",
-        provenance: Mapping[str, str] | None = None,
+        provenance: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.left_out: Counter[str] = Counter()
         """Number of frames that the format does not support, by their kind."""
@@ -70,7 +71,7 @@ class CanLogWriter:
             case "trc":
                 self._trc(file, start_ns)
             case _:
-                self._mf4(file, start_ns, provenance or {})
+                self._mf4(file, start_ns, provenance)
 
     def _candump(self, file: IO[bytes], offset_ns: int) -> None:
         half = 500 + offset_ns
