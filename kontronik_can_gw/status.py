@@ -21,7 +21,7 @@ class GatewayState(IntEnum):
     STOPPING = 2
     REPLAY = 3
     QUIET = 4
-    """No ESC has been heard for ``can.quiet_after_s``. Only requests are answered."""
+    """No ESC has been heard for the configured time. Only requests are answered."""
 
 
 class CanState(IntEnum):

@@ -87,16 +87,7 @@ class Loaded:
 
     @property
     def core_settings(self) -> CoreSettings:
-        return core_settings(self.escs, self.layout, self.config)
-
-
-def core_settings(
-    escs: Sequence[EscSettings],
-    layout: MessageLayout,
-    config: Config,
-) -> CoreSettings:
-    """Return the settings of the core according to a configuration."""
-    return CoreSettings(escs, layout, config.dbc.silent_on_loss, config.can.quiet_after_ns)
+        return self.config.core_settings(self.escs, self.layout)
 
 
 def load_configuration(
@@ -238,7 +229,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
     for fitted in outputs:
         warnings += fitted.warnings(config.file, config.can.bitrate)
         damaged += fitted.faults
-    settings = core_settings(escs, dbc.layout, config)
+    settings = config.core_settings(escs, dbc.layout)
     mute = unreported(settings) + unsupplied(settings) + without_quiet(settings)
     return Loaded(
         config=config,

@@ -4,10 +4,10 @@ JSON keys of the header::
 
     format, version  "kontronik-can-gw capture", 2
     program          version, python, machine
-    quiet_after_ns   can.quiet_after_s in ns. Missing in captures of 0.5.0
+    numbers of the core by name (core/settings.py: NUMBERS). Missing in captures of 0.5.0
     configuration    the effective TOML text
     file             the path of the configuration
-    escs             settings of each ESC that were in effect, with a gear such as "31/4"
+    escs             settings of each ESC that were in effect, with ratios such as "31/4"
     ports            the serial ports of the ESCs
     dbc              file, text (one character a byte), fd, silent_on_loss, likely_data_ids and
                      the keys of [dbc]. null without a DBC. likely_data_ids is true if E2E data IDs
@@ -26,7 +26,7 @@ start of the gateway, and last_step_ns and last_step_by_ns.
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw import __version__
@@ -45,7 +45,7 @@ from kontronik_can_gw.core.header_parts import (
     whole_number,
 )
 from kontronik_can_gw.core.output_setup import OUTPUTS, OutputSetup, setup_module
-from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.core.settings import NUMBERS, CoreSettings
 from kontronik_can_gw.dbc.prepare import prepare
 from kontronik_can_gw.dbc.protection import remove_later_data_ids
 from kontronik_can_gw.dbc.reader import parse_database
@@ -65,9 +65,9 @@ _IN_HEADER = ("canopen",)
 """Outputs with a key in the header itself, as in captures of 0.5.0. Others are in "outputs"."""
 _OTHER_DBC_NAMES = {"e2e_data_ids": "data_ids", "send_type": "send_types"}
 _DBC_KEYS = {
-    field.name: _OTHER_DBC_NAMES.get(field.name, field.name)
-    for field in fields(DbcConfig)
-    if field.name not in ("enabled", "file", "on_loss")
+    each.name: _OTHER_DBC_NAMES.get(each.name, each.name)
+    for each in fields(DbcConfig)
+    if each.name not in ("enabled", "file", "on_loss")
 }
 """For each key of [dbc], its name in a header."""
 _TYPES = {
@@ -100,7 +100,8 @@ class CaptureSetup:
     version: int = VERSION
     """The version of the capture's format. 0.5.0 wrote version 1."""
     outputs: tuple[OutputSetup, ...] = ()
-    quiet_after_ns: int = 0
+    core_numbers: Mapping[str, int] = field(default_factory=dict)
+    """The settings of the core that are one number (``core/settings.py``: NUMBERS)."""
     has_likely_data_ids: bool = True
     """False if the run did not use E2E data IDs that 0.5.0 did not use either."""
 
@@ -121,7 +122,7 @@ class CaptureSetup:
             "escs": [esc_json(esc) for esc in self.escs],
             "ports": list(self.ports),
             "dbc": self._dbc_json(),
-            "quiet_after_ns": self.quiet_after_ns,
+            **self.core_numbers,
             **in_header,
             "outputs": outputs,
         }
@@ -166,6 +167,9 @@ class CaptureSetup:
                 settings = _dbc_settings(dbc)
         with reading("escs"):
             escs = tuple(esc_of(esc) for esc in header["escs"])
+        core_numbers = {}
+        for name, high in NUMBERS.items():
+            core_numbers[name] = whole_number(header.get(name, 0), 0, high)
         return cls(
             escs=escs,
             ports=tuple(map(str, header["ports"])),
@@ -176,7 +180,7 @@ class CaptureSetup:
             file=str(header["file"]),
             version=header["version"],
             outputs=_outputs_of(header, escs),
-            quiet_after_ns=whole_number(header.get("quiet_after_ns", 0), 0, END_OF_TIME - 1),
+            core_numbers=core_numbers,
             has_likely_data_ids=bool(dbc and dbc.get("likely_data_ids")),
         )
 
@@ -193,7 +197,7 @@ class CaptureSetup:
     def gateway(self, layout: MessageLayout, now: int) -> Gateway:
         """Return the gateway in its state before the start."""
         is_silent = self.dbc_settings.silent_on_loss
-        settings = CoreSettings(self.escs, layout, is_silent, self.quiet_after_ns)
+        settings = CoreSettings(self.escs, layout, is_silent, **self.core_numbers)
         return Gateway(settings, now, self.outputs)
 
 

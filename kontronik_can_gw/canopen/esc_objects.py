@@ -85,8 +85,7 @@ class EscObjects:
             if link is LinkState.PORT_ERROR:
                 emergencies.set(GatewayError.PORT_GONE, True, now)
             is_silent = link is LinkState.LOST
-            expired_ns = esc.live_bound_ns + esc.settings.timeout_ns
-            emergencies.set(GatewayError.TELEMETRY_LOST, is_silent, now, at=expired_ns)
+            emergencies.set(GatewayError.TELEMETRY_LOST, is_silent, now, at=esc.live_until_ns)
             is_degraded = link is LinkState.DEGRADED
             emergencies.set(GatewayError.CRC_RATE, is_degraded, now)
             is_port_gone = link is LinkState.PORT_ERROR

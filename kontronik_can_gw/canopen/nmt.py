@@ -167,7 +167,7 @@ class Producer:
 class _Watched:
     """The watch over one node. It begins with the first heartbeat."""
 
-    timeout_ns: int
+    consumer_ns: int
     due: int = NEVER
     is_lost: bool = False
 
@@ -233,7 +233,7 @@ class Consumer:
         if len(data) != 1 or watched is None:
             return
         self._report_late(at, now)  # also this heartbeat may be late
-        watched.due = at + watched.timeout_ns
+        watched.due = at + watched.consumer_ns
         if watched.is_lost:
             watched.is_lost = False
             self._changed(node_id, False, now, at)
@@ -260,10 +260,10 @@ class Consumer:
         """Take over 1016h. Unchanged watches continue."""
         before = self._watched
         self._watched = {}
-        for node_id, timeout_ns in self._entries():
+        for node_id, consumer_ns in self._entries():
             watched = before.get(node_id)
-            if watched is None or watched.timeout_ns != timeout_ns:
-                watched = _Watched(timeout_ns)
+            if watched is None or watched.consumer_ns != consumer_ns:
+                watched = _Watched(consumer_ns)
             self._watched[node_id] = watched
 
     def _written(self, now: int) -> None:
@@ -305,7 +305,7 @@ def _watch_of(value: Value) -> tuple[int, int] | None:
     if not isinstance(value, int):
         return None
     node_id = value >> 16 & 0xFF
-    timeout_ns = (value & 0xFFFF) * MS
-    if not 1 <= node_id <= 127 or not timeout_ns:
+    consumer_ns = (value & 0xFFFF) * MS
+    if not 1 <= node_id <= 127 or not consumer_ns:
         return None
-    return node_id, timeout_ns
+    return node_id, consumer_ns

@@ -14,7 +14,7 @@ from kontronik_can_gw.canopen.storage import APPLICATION, Stored
 from kontronik_can_gw.esc.telemetry import (
     CELL_COUNTS,
     TIMEOUTS_MS,
-    WRITTEN_POLE_PAIRS,
+    WRITTEN,
     EscSettings,
 )
 from kontronik_can_gw.times import MS
@@ -60,7 +60,7 @@ def esc_settings(dictionary: Dictionary, base: EscSettings) -> EscSettings:
         held[sub] = dictionary.number(at.SETTINGS, sub, own)
     # These limits hold whatever the EDS allows.
     shortest_ms, longest_ms = TIMEOUTS_MS
-    fewest_pole_pairs, _ = WRITTEN_POLE_PAIRS
+    fewest_pole_pairs, _ = WRITTEN["pole_pairs"]
     _, most_cells = CELL_COUNTS
     return replace(
         base,

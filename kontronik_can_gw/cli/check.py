@@ -98,7 +98,7 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     yield f"  CAN       {can.channel} ({can.interface}), {rate}"
     if can.quiet_after_s:
         yield f"            quiet after {can.quiet_after_s} s without telemetry"
-    if can.restart_after_s and can.interface == "socketcan":
+    if can.restart_after_ns:
         yield f"            restarted after {can.restart_after_s:g} s in which no frame has left,"
         yield "            if root or the service's user runs the gateway"
     if config.dbc.enabled:

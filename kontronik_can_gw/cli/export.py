@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from kontronik_can_gw.assembly.assemble import core_settings
 from kontronik_can_gw.cli.arguments import option
 from kontronik_can_gw.cli.common import say, stopping_on_signals
 from kontronik_can_gw.cli.desk import bus_layout
@@ -55,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
     bus = bus_layout(args)
     settings = CoreSettings(bus.escs, bus.layout)
     if bus.config is not None:
-        settings = core_settings(bus.escs, bus.layout, bus.config)
+        settings = bus.config.core_settings(bus.escs, bus.layout)
     licence = shipped("LICENSE").read_text(encoding="utf-8")
     try:
         files = exported(settings, licence)

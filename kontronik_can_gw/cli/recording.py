@@ -93,5 +93,5 @@ def setup_of(loaded: Loaded) -> CaptureSetup:
         as_toml(config),
         config.file,
         outputs=loaded.outputs,
-        quiet_after_ns=config.can.quiet_after_ns,
+        core_numbers=loaded.core_settings.numbers,
     )

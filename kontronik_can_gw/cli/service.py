@@ -175,7 +175,7 @@ def _install(args: argparse.Namespace, root: Path) -> None:
         _enable(root, unit, template)
         lines.append(f"{unit} is enabled. See: systemctl status {unit}")
         can = load(root / config).can
-        if can.restart_after_s and can.interface == "socketcan":
+        if can.restart_after_ns:
             path_unit = f"{_RESTART}@{can.channel}.path"
             units.append(path_unit)
             _enable(root, path_unit, f"{_RESTART}@.path")

@@ -4,7 +4,7 @@ parse.py checks a configuration by these rows. export.py and the docs are made f
 docstring of a table's class is its description in the docs and in the JSON Schema.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -33,8 +33,10 @@ from kontronik_can_gw.config.output_keys import (
     DbcConfig,
     DronecanConfig,
 )
+from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.protocols import PROTOCOLS, device_names, protocol_named, protocol_names
 from kontronik_can_gw.esc.telemetry import CELL_COUNTS, POLE_PAIRS, TIMEOUTS_MS, EscSettings
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.status import UNCONFIGURED
 from kontronik_can_gw.times import MS, SECOND
 
@@ -85,6 +87,12 @@ class CanConfig:
     @property
     def quiet_after_ns(self) -> int:
         return self.quiet_after_s * SECOND
+
+    @property
+    def restart_after_ns(self) -> int:
+        """Time after which a restart is requested. 0: never, as for all but SocketCAN."""
+        is_socketcan = self.interface == "socketcan"
+        return round(self.restart_after_s * SECOND) if is_socketcan else 0
 
 
 @dataclass(frozen=True)
@@ -244,6 +252,10 @@ class Config:
     @cached_property
     def escs(self) -> list[EscSettings]:
         return [esc.settings for esc in self.esc]
+
+    def core_settings(self, escs: Sequence[EscSettings], layout: MessageLayout) -> CoreSettings:
+        """Return the settings of the core."""
+        return CoreSettings(escs, layout, self.dbc.silent_on_loss, self.can.quiet_after_ns)
 
     @property
     def dbc_path(self) -> Path:

@@ -209,7 +209,7 @@ def _is_ambiguous(name: str, starts: set[str]) -> bool:
 
 def _without_effect(can: CanConfig, record: RecordConfig) -> Iterator[str]:
     """Yield a line for each key that has no effect because of another key."""
-    if can.restart_after_s and can.interface != "socketcan":
+    if can.restart_after_s and not can.restart_after_ns:
         yield (
             f"can.restart_after_s: has no effect with the interface {can.interface}, because only "
             "SocketCAN interfaces can be restarted"

@@ -168,7 +168,7 @@ class EscStream(EscTelemetry):
     def expire(self, now: int) -> int:
         """Drop live and info data that is too old at ``now``. Return the events."""
         events = Event.NONE
-        if self.live is not None and now - self.live_bound_ns > self.settings.timeout_ns:
+        if self.live is not None and now > self.live_until_ns:
             events |= self._lose(LinkState.LOST)
         if self.info_bound_ns is not None and now - self.info_bound_ns > INFO_TIMEOUT_NS:
             self._forget_device()
@@ -183,7 +183,7 @@ class EscStream(EscTelemetry):
         """Return the time at which live or info data expire, or NEVER."""
         deadline = NEVER
         if self.live is not None:
-            deadline = min(deadline, self.live_bound_ns + self.settings.timeout_ns + 1)
+            deadline = min(deadline, self.live_until_ns + 1)
         if self.info_bound_ns is not None:
             deadline = min(deadline, self.info_bound_ns + INFO_TIMEOUT_NS + 1)
         return deadline

@@ -13,18 +13,14 @@ from typing import Any
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import (
-    CELL_COUNTS,
-    WRITTEN_POLE_PAIRS,
-    WRITTEN_TIMEOUTS_MS,
+    WRITTEN,
     EscSettings,
 )
-from kontronik_can_gw.times import MS
 
 _UNUSABLE = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError)
 """Errors of Python if a part of a header is missing or has another type."""
 _MAX_NAME = 12
 """Maximum length of an ESC's name."""
-_MAX_GEAR = 10**12
 LATEST_NS = 1 << 62
 """Largest time or duration in a header, in ns."""
 
@@ -84,7 +80,10 @@ def file_bytes(text: str, part: str) -> bytes:
 
 def esc_json(esc: EscSettings) -> dict[str, Any]:
     """Return the JSON form of an ESC's settings."""
-    return asdict(esc) | {"gear": str(esc.gear)}
+    found = {}
+    for name, value in asdict(esc).items():
+        found[name] = str(value) if isinstance(value, Fraction) else value
+    return found
 
 
 def esc_of(found: Mapping[str, Any]) -> EscSettings:
@@ -92,19 +91,21 @@ def esc_of(found: Mapping[str, Any]) -> EscSettings:
 
     They must be in the ranges of the configuration, or in those that a CANopen master may write.
     """
-    numerator, _, denominator = found["gear"].partition("/")
-    gear = Fraction(
-        whole_number(numerator, 1, _MAX_GEAR),
-        whole_number(denominator or "1", 1, _MAX_GEAR),
-    )
-    shortest_ms, longest_ms = WRITTEN_TIMEOUTS_MS
+    numbers: dict[str, Any] = {}
+    for name, limits in WRITTEN.items():
+        if isinstance(getattr(EscSettings, name), Fraction):
+            numbers[name] = _ratio(found[name], *limits)
+        else:
+            numbers[name] = whole_number(found[name], *limits)
     return EscSettings(
         name=short_text(found["name"], _MAX_NAME),
-        pole_pairs=whole_number(found["pole_pairs"], *WRITTEN_POLE_PAIRS),
-        gear=gear,
-        cell_count=whole_number(found["cell_count"], *CELL_COUNTS),
-        timeout_ns=whole_number(found["timeout_ns"], shortest_ms * MS, longest_ms * MS),
-        crc_error_threshold=whole_number(found["crc_error_threshold"], 0, 0xFFFF_FFFF),
         # Captures of 0.5.0 name no protocol.
         protocol=protocol_named(found.get("protocol")).name,
+        **numbers,
     )
+
+
+def _ratio(text: str, low: int, high: int) -> Fraction:
+    """Return a ratio such as "31/4". Both numbers are in the range."""
+    numerator, _, denominator = text.partition("/")
+    return Fraction(whole_number(numerator, low, high), whole_number(denominator or "1", low, high))

@@ -51,8 +51,6 @@ class Core(Protocol):
     followers: Sequence[Follower]
     link_changes: list[int]
     """ESCs whose link state, layout or device changed. The owner empties the list."""
-    shortest_timeout_ns: int
-    """The shortest timeout of all ESCs, after which live data are not available."""
 
     @property
     def escs(self) -> Sequence[EscTelemetry]:

@@ -34,7 +34,6 @@ class PythonCore:
         self.gateway_changed = self.messages.on_gateway_change
         self.repeat = self.messages.repeat
         self.stop = self.messages.stop
-        self.shortest_timeout_ns = self._shortest_timeout()
         self.followers: Sequence[Follower] = ()
         self.link_changes: list[int] = []
         self._quiet_after_ns = settings.quiet_after_ns
@@ -72,7 +71,6 @@ class PythonCore:
 
     def apply(self, esc: int, settings: EscSettings) -> None:
         self.escs[esc].apply(settings)
-        self.shortest_timeout_ns = self._shortest_timeout()
         self._next_expiry = 0
 
     # --- a replay that begins later in a run
@@ -83,9 +81,6 @@ class PythonCore:
     def adopt_places(self, places: Sequence[Sequence[int]]) -> None:
         self.messages.adopt_places(places)
         self._next_expiry = 0
-
-    def _shortest_timeout(self) -> int:
-        return min(esc.settings.timeout_ns for esc in self.escs)
 
     # --- time
 

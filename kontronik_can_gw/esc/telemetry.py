@@ -4,7 +4,7 @@ core/esc_stream.py, or its twin in C, computes this state from bytes and time. `
 number of nanoseconds of one monotonic clock.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from enum import IntEnum
 from fractions import Fraction
@@ -65,9 +65,17 @@ POLE_PAIRS = (1, 100)
 CELL_COUNTS = (0, 0xFF)
 TIMEOUTS_MS = (20, 60_000)
 """Smallest and greatest setting of an ESC, in a configuration and for use."""
-WRITTEN_POLE_PAIRS = (1, 0xFFFF)
-WRITTEN_TIMEOUTS_MS = (1, 1 << 16)
-"""Limits of settings in captures: of the objects to which a CANopen master writes them (2100h)."""
+WRITTEN: Mapping[str, tuple[int, int]] = {
+    "pole_pairs": (1, 0xFFFF),
+    "gear": (1, 10**12),
+    "cell_count": CELL_COUNTS,
+    "timeout_ns": (MS, MS << 16),
+    "crc_error_threshold": (0, 0xFFFF_FFFF),
+}
+"""Limits of settings in captures: of the objects to which a CANopen master writes them (2100h).
+
+The limits of a gear are those of its numerator and denominator.
+"""
 
 
 @dataclass(frozen=True)
@@ -208,6 +216,11 @@ class EscTelemetry:
         self.pole_pairs = settings.pole_pairs
         self.shaft_divisor = settings.pole_pairs * settings.gear.numerator
         self.gear_denominator = settings.gear.denominator
+
+    @property
+    def live_until_ns(self) -> int:
+        """Time until which the newest live frame is fresh."""
+        return self.live_bound_ns + self.settings.timeout_ns
 
     @property
     def up(self) -> bool:

@@ -1543,9 +1543,9 @@ static int64_t quiet_deadline(const kcg *g)
 {
     if (is_quiet(g))
         return g->gateway[KCG_ESCS_OK] ? g->gateway[KCG_HEARD_NS] : KCG_NEVER;
-    if (!g->plan->quiet_after || g->gateway[KCG_ESCS_OK])
+    if (!g->plan->quiet_after_ns || g->gateway[KCG_ESCS_OK])
         return KCG_NEVER;
-    return g->gateway[KCG_HEARD_NS] + g->plan->quiet_after;
+    return g->gateway[KCG_HEARD_NS] + g->plan->quiet_after_ns;
 }
 
 /* Begins quiet mode, or ends it. */

@@ -273,7 +273,7 @@ typedef struct {
        with values of the gateway are sent for the last time, and then nothing is sent. Live data
        of an ESC end it. KCG_GATEWAY_STATE changes from KCG_STATE_RUNNING to KCG_STATE_QUIET and
        back. */
-    int64_t quiet_after;
+    int64_t quiet_after_ns;
 } kcg_plan;
 
 /* State of an ESC. Fields that are used often are at the beginning, because the instructions of

@@ -102,7 +102,6 @@ class NativeCore:
         self._followers: Sequence[Follower] = ()
         self.choose_events()
         self.link_changes: list[int] = []
-        self.shortest_timeout_ns = min(esc.timeout_ns for esc in escs)
 
     def _make(self, tables: Tables, now: int) -> None:
         """Start the core. ``state``, ``esc_states``, ``sending`` and ``pending`` are its memory."""
@@ -299,8 +298,6 @@ class NativeCore:
             if signal.esc == esc:
                 self.signals[index] = rescaled(made, signal, settings)
         self.escs[esc].apply(settings)
-        timeouts = [each.settings.timeout_ns for each in self.escs]
-        self.shortest_timeout_ns = min(timeouts)
 
     def gateway_changed(self, now: int) -> None:
         self.library.kcg_gateway_changed(self.core, 0, now)

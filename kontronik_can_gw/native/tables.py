@@ -76,7 +76,7 @@ class Tables:
         self.listeners_of: list[list[int]] = [[] for _ in escs]
         """For each ESC, the messages that follow its events."""
         self.of_settings: dict[int, tuple[Any, SignalPlan]] = {}
-        """Rows of ``signals`` that contain the pole pairs and the gear of their ESC, by index."""
+        """Rows of ``signals`` that contain settings of their ESC, by index."""
         self._escs = escs
         self._wire = [places_of(protocol_named(esc.protocol)) for esc in escs]
         starts = phases([plan.cycle_ns for plan in layout.messages])
@@ -144,7 +144,7 @@ class Tables:
             "escs": len(self.settings),
             "pages": self.pages,
             "slots": slots,
-            "quiet_after": self._core_settings.quiet_after_ns,
+            **self._core_settings.numbers,
         }
 
     def _add(self, plan: MessagePlan, phase: int) -> None:

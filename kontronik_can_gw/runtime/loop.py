@@ -34,12 +34,6 @@ if TYPE_CHECKING:
     from kontronik_can_gw.runtime.native_poller import NativePoller
     from kontronik_can_gw.runtime.system.clock import ClockWatch
 
-_WAKES_PER_TIMEOUT = 4
-"""Number of times that the loop wakes at least within the shortest telemetry timeout.
-
-A value may expire early by this part of the timeout. The loop wakes a millisecond earlier than
-that, because a wait is rounded up to a millisecond.
-"""
 _QUIET_PERIOD_NS = SECOND
 """Longest wait in quiet mode. Without telemetry, no value can expire."""
 _LAST_SAVE_S = 0.2
@@ -191,10 +185,15 @@ class Loop:
             self._housekeeping.run(now)
 
     def _wait(self) -> Work:
-        """Wait for work, and meanwhile let C run iterations if possible."""
+        """Wait for work, and meanwhile let C run iterations if possible.
+
+        The loop wakes at least four times within the shortest telemetry timeout. A value may expire
+        early by this quarter of the timeout.
+        """
         gateway = self.gateway
         own_due = self._own_deadline()
-        period = gateway.core.shortest_timeout_ns // _WAKES_PER_TIMEOUT - MS
+        # A wait is rounded up to a millisecond.
+        period = self.can.gate.quarter_ns - MS
         if gateway.status.is_quiet:
             period = _QUIET_PERIOD_NS
         if self._native is not None and self._native.can_run(self.can):

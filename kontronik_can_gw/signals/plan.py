@@ -155,7 +155,7 @@ class MessagePlan:
 
     @property
     def can_stop(self) -> bool:
-        """True if it stops while telemetry is lost, if ``dbc.on_loss`` is "silent".
+        """True if it stops while telemetry is lost, if the gateway is configured so.
 
         Messages with the state of the link are always sent.
         """

@@ -74,7 +74,7 @@ class Bench:
                 self.setup.escs,
                 self.layout,
                 silent_on_loss=self.setup.dbc_settings.silent_on_loss,
-                quiet_after_ns=self.setup.quiet_after_ns,
+                **self.setup.core_numbers,
             ),
             START,
             outputs=self.setup.outputs,
@@ -159,7 +159,10 @@ class Bench:
                     gateway.held_up(now, rng.random() < 0.5)
                 for index, esc in enumerate(escs):
                     data = b"".join(sent.wire for sent in esc.frames_until(now))
-                    if self.setup.quiet_after_ns and (now - START) // (2 * SECOND) % 2:
+                    if (
+                        self.setup.core_numbers.get("quiet_after_ns")
+                        and (now - START) // (2 * SECOND) % 2
+                    ):
                         data = b""
                     if data and open_ports[index]:
                         cut = rng.randrange(len(data) + 1)

@@ -141,4 +141,4 @@ def test_the_lists_of_numbers_are_complete(proofs: list[Proof]) -> None:
     lists = {"constant", "esc_of", "listener", "first_listener"}
     assert tables.arrays.keys() == {*ROWS, *lists} - {"settings"}
     lengths = {"words", "messages", "escs", "slots"}
-    assert tables.counts.keys() == {"pages", "quiet_after", *lengths}
+    assert tables.counts.keys() == {"pages", "quiet_after_ns", *lengths}

@@ -16,7 +16,7 @@ from kontronik_can_gw.runtime.can import interface_restart
 from kontronik_can_gw.runtime.can.can_port import CanPort
 from kontronik_can_gw.runtime.can.gate_reports import GateReports
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
-from kontronik_can_gw.times import MS, SECOND
+from kontronik_can_gw.times import MS
 
 MAX_LATE_NS = 250 * MS
 """Longest delay of a measurement. The shortest telemetry time-out may be a lower limit."""
@@ -38,8 +38,7 @@ class Transmitter:
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.queue = TransmitQueue()
-        restart_after_s = config.restart_after_s if config.interface == "socketcan" else 0
-        self.gate = Gate(gateway.core.shortest_timeout_ns, round(restart_after_s * SECOND))
+        self.gate = Gate(_shortest_timeout_ns(gateway), config.restart_after_ns)
         self.ask_restart: Callable[[str], None] = interface_restart.request
         self.reports = GateReports(config, self.gate, gateway.status, conditions)
         self._channel = config.channel
@@ -69,9 +68,8 @@ class Transmitter:
         }
 
     def max_turn_ns(self) -> int:
-        """Return the age at which a frame is too old to be sent, from the iteration's start."""
-        limit = self._gateway.core.shortest_timeout_ns
-        return min(MAX_LATE_NS, limit)
+        """Return the age at which a frame is too old to be sent, counted from its turn's start."""
+        return min(MAX_LATE_NS, self.gate.timeout_ns)
 
     @property
     def is_idle(self) -> bool:
@@ -117,7 +115,7 @@ class Transmitter:
     def _transmit(self, port: CanPort | None, now: int) -> Sent | None:
         gate = self.gate
         gateway = self._gateway
-        gate.timeout_ns = gateway.core.shortest_timeout_ns
+        gate.timeout_ns = _shortest_timeout_ns(gateway)
         if gate.is_quiet != gateway.status.is_quiet:
             self._follow_quiet(now)
         gate.advance(now)
@@ -293,3 +291,8 @@ class Transmitter:
         status.dropped_frames += queue.dropped
         queue.replaced = 0
         queue.dropped = 0
+
+
+def _shortest_timeout_ns(gateway: Gateway) -> int:
+    """Return the shortest timeout of all ESCs, after which live data are not available."""
+    return min([esc.settings.timeout_ns for esc in gateway.escs])

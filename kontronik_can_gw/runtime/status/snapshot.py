@@ -202,7 +202,7 @@ def _esc(esc: EscTelemetry, port: PortFacts, status: GatewayStatus, now: int) ->
     """
     live = esc.live
     info = esc.info
-    if live is not None and now - esc.live_bound_ns > esc.settings.timeout_ns:
+    if live is not None and now > esc.live_until_ns:
         live = None
     if esc.info_bound_ns is None or now - esc.info_bound_ns > INFO_TIMEOUT_NS:
         info = None

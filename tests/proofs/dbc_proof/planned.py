@@ -361,7 +361,7 @@ def wrong_tables(
         "escs": len(tables.settings),
         "pages": sum(pages for pages, _ in expected),
         "slots": 0,
-        "quiet_after": quiet_after_ns,
+        "quiet_after_ns": quiet_after_ns,
     }
     for name, number in counts.items():
         if number != wanted.get(name):
