@@ -26,7 +26,7 @@ class EntryKind(IntEnum):
     """Parameters were stored. flags 1: storing failed (the reason in UTF-8)."""
     DAMAGED = 13
     COUNTERS = 14
-    """The runtime changed the gateway's counters (``capture/format.py``, ``COUNTERS``)."""
+    """The runtime changed the gateway's counters (``capture/format.py``, ``RECORDED_COUNTERS``)."""
     LINE_ERRORS = 15
     """The total number of line errors of an ESC's port (u64)."""
     CLOCK = 16

@@ -45,9 +45,22 @@ class NmtState(IntEnum):
     PRE_OPERATIONAL = 127
 
 
+COUNTERS = (
+    "sent_frames",
+    "replaced_frames",
+    "send_failures",
+    "received_frames",
+    "bus_off_count",
+    "dropped_frames",
+    "id_conflicts",
+    "can_restarts",
+)
+"""The counters of GatewayStatus. Each is a published value."""
+
+
 @dataclass(slots=True)
 class GatewayStatus:
-    """The gateway's own state and counters. The runtime writes those of the CAN interface."""
+    """The gateway's own state and its COUNTERS. The runtime writes those of the CAN interface."""
 
     state: GatewayState = GatewayState.STARTING
     can_state: CanState = CanState.UNKNOWN

@@ -42,6 +42,7 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.entry_kinds import EntryKind as EntryKind
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.status import COUNTERS
 
 SUFFIX = ".kcap"
 MAGIC = b"KCB1"
@@ -235,17 +236,7 @@ def read_frame(data: bytes) -> CanFrame:
     )
 
 
-COUNTERS = (
-    "sent_frames",
-    "replaced_frames",
-    "send_failures",
-    "received_frames",
-    "bus_off_count",
-    "dropped_frames",
-    "id_conflicts",
-    "started_ns",
-    "can_restarts",
-)
+RECORDED_COUNTERS = (*COUNTERS[:7], "started_ns", *COUNTERS[7:])
 """Attributes of GatewayStatus in a COUNTERS entry, in its order.
 
 The last one is missing in captures of version 0.5.

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from kontronik_can_gw.capture.format import COUNTERS
+from kontronik_can_gw.capture.format import RECORDED_COUNTERS
 from kontronik_can_gw.core.header_parts import whole_number
 from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY
 from kontronik_can_gw.times import END_OF_TIME, SECOND
@@ -19,9 +19,9 @@ def check_time(time_ns: int) -> None:
 
 def check_counters(counters: Sequence[int]) -> None:
     """Raise ValueError for numbers that are impossible in a COUNTERS entry."""
-    if len(counters) not in (len(COUNTERS), len(COUNTERS) - 1):
+    if len(counters) not in (len(RECORDED_COUNTERS), len(RECORDED_COUNTERS) - 1):
         raise ValueError("has an unexpected number of counters")
-    for name, counter in zip(COUNTERS, counters, strict=False):
+    for name, counter in zip(RECORDED_COUNTERS, counters, strict=False):
         if name == "started_ns":
             check_time(counter)
         elif counter >= MAX_COUNT:

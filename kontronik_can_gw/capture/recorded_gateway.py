@@ -9,7 +9,7 @@ from operator import attrgetter
 from typing import Any
 
 from kontronik_can_gw.capture.calls import Recorded, RecordedCall, calls_by_method
-from kontronik_can_gw.capture.format import COUNTERS, EntryKind, numbers_data
+from kontronik_can_gw.capture.format import RECORDED_COUNTERS, EntryKind, numbers_data
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.status import GatewayStatus
@@ -18,7 +18,7 @@ Put = Callable[[int, int, int, bytes, int, int | None], None]
 """A function with the fields of ``Entry``: time, kind, ESC's index, data, flags, arrival."""
 
 
-_counters_of: Callable[[GatewayStatus], tuple[int, ...]] = attrgetter(*COUNTERS)
+_counters_of: Callable[[GatewayStatus], tuple[int, ...]] = attrgetter(*RECORDED_COUNTERS)
 Call = tuple[int, int, int, bytes, int | None]
 """Time, kind, ESC's index, data, arrival."""
 

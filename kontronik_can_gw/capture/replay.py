@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.capture.calls import CALL_OF, RecordedCall
 from kontronik_can_gw.capture.format import (
-    COUNTERS,
+    RECORDED_COUNTERS,
     VERSION,
     Entry,
     EntryKind,
@@ -154,7 +154,7 @@ class Replay:
             case EntryKind.COUNTERS:
                 counters = read_numbers(entry.data)
                 check_counters(counters)
-                for name, value in zip(COUNTERS, counters, strict=False):
+                for name, value in zip(RECORDED_COUNTERS, counters, strict=False):
                     setattr(self.gateway.status, name, value)
             case EntryKind.LINE_ERRORS:
                 (self.gateway.escs[entry.esc].line_errors,) = read_numbers(entry.data)
@@ -195,7 +195,7 @@ class Replay:
             if "counters" in found:
                 esc.adopt_stream_state(found["counters"], found["held"], found["window"])
         self.gateway.core.adopt_places(state.get("messages", ()))
-        for name, value in zip(COUNTERS, state.get("counters", ()), strict=False):
+        for name, value in zip(RECORDED_COUNTERS, state.get("counters", ()), strict=False):
             setattr(self.gateway.status, name, value)
         if "started_ns" in state:
             self.gateway.status.started_ns = state["started_ns"]

@@ -16,7 +16,7 @@ from typing import Any
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import PROTOCOLS, protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, LinkState
-from kontronik_can_gw.status import CanState, GatewayState, GatewayStatus
+from kontronik_can_gw.status import COUNTERS, CanState, GatewayState, GatewayStatus
 from kontronik_can_gw.times import MS, SECOND
 
 MWS_PER_WH = 3_600_000
@@ -402,16 +402,7 @@ def _make_gateway_values() -> Iterator[Value]:
         per_unit=1000,
         read=uptime,
     )
-    for name in (
-        "sent_frames",
-        "replaced_frames",
-        "send_failures",
-        "received_frames",
-        "bus_off_count",
-        "dropped_frames",
-        "id_conflicts",
-        "can_restarts",
-    ):
+    for name in COUNTERS:
         yield _gateway_value(name, rolls=True)
 
 

@@ -14,7 +14,7 @@ from kontronik_can_gw.core.messages import Traits, phases
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
-from kontronik_can_gw.esc.values import Divisor, Group, Kind, Value
+from kontronik_can_gw.esc.values import VALUES, Divisor, Group, Kind, Value
 from kontronik_can_gw.native.header import KCG
 from kontronik_can_gw.native.rows import (
     COUNTS,
@@ -259,20 +259,6 @@ _COUNTERS = {
     (Kind.OBJECT, "live_counter"): "live_frames",
 }
 """Maps kind and name of a value to a name of COUNTS."""
-_OF_GATEWAY = (
-    "gateway_state",
-    "can_state",
-    "esc_count",
-    "escs_ok",
-    "sent_frames",
-    "replaced_frames",
-    "send_failures",
-    "received_frames",
-    "bus_off_count",
-    "dropped_frames",
-    "id_conflicts",
-    "can_restarts",
-)
 SOURCES: dict[tuple[Kind, str], tuple[int, int]] = {
     (Kind.PRODUCT, "battery_power"): (KCG.OF_POWER, 0),
     (Kind.INTEGRAL, "energy_used"): (KCG.OF_ENERGY, 0),
@@ -282,7 +268,11 @@ SOURCES: dict[tuple[Kind, str], tuple[int, int]] = {
     (Kind.GATEWAY, "uptime"): (KCG.OF_UPTIME, 0),
     (Kind.OBJECT, "link_status"): (KCG.OF_STATUS, GatewayState.REPLAY),
     **{key: (KCG.OF_COUNT, COUNTS.index(name)) for key, name in _COUNTERS.items()},
-    **{(Kind.GATEWAY, name): (KCG.OF_GATEWAY, GATEWAY.index(name)) for name in _OF_GATEWAY},
+    **{
+        (Kind.GATEWAY, name): (KCG.OF_GATEWAY, GATEWAY.index(name))
+        for name in GATEWAY
+        if name in VALUES
+    },
 }
 """``kind`` and ``place`` of a row of kcg_signal for each value that is not a field of the wire.
 

@@ -10,7 +10,13 @@ from typing import Any
 import pytest
 from capture_bench import START, Bench, capture, made
 
-from kontronik_can_gw.capture.format import COUNTERS, Entry, EntryKind, json_payload, numbers_data
+from kontronik_can_gw.capture.format import (
+    RECORDED_COUNTERS,
+    Entry,
+    EntryKind,
+    json_payload,
+    numbers_data,
+)
 from kontronik_can_gw.capture.limits import check_state
 from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.desk.recordings.inputs import open_input
@@ -87,11 +93,13 @@ def test_an_impossible_state_of_a_stream_is_refused(bad: dict[str, Any]) -> None
         ("messages", [[0, 0, 0, -2, 0]]),
         ("messages", [[0, 0, 0, -1, 2]]),
         ("messages", [[0, 0]]),
-        ("counters", [-1] * len(COUNTERS)),
+        ("counters", [-1] * len(RECORDED_COUNTERS)),
     ],
 )
 def test_impossible_counters_of_messages_and_gateway_are_refused(key: str, bad: object) -> None:
-    check_state(GOOD | {"messages": [[3, 0, START, -1, 0]], "counters": [1] * len(COUNTERS)})
+    check_state(
+        GOOD | {"messages": [[3, 0, START, -1, 0]], "counters": [1] * len(RECORDED_COUNTERS)}
+    )
     with pytest.raises(ValueError):
         check_state(GOOD | {key: bad})
 
@@ -108,7 +116,7 @@ def test_a_hostile_state_cannot_leave_the_ranges_of_the_core(
     state = GOOD | {
         "escs": [GOOD["escs"][0] | stream],  # type: ignore[index]
         "messages": [[0xFFFF, 0xFF, 0, END_OF_TIME - 1, 1]] * 100,
-        "counters": [1] * len(COUNTERS),
+        "counters": [1] * len(RECORDED_COUNTERS),
     }
     check_state(state)
     replay = Replay(bench.setup.gateway(bench.layout, START), state)
@@ -125,7 +133,7 @@ def test_a_hostile_state_cannot_leave_the_ranges_of_the_core(
 )
 def test_impossible_counters_are_rejected_and_change_nothing(started_ns: int) -> None:
     bench = Bench(*made(1)).live(1, 0.5)
-    counters = [3] * (len(COUNTERS) - 2)  # the last two are start and restarts
+    counters = [3] * (len(RECORDED_COUNTERS) - 2)  # the last two are start and restarts
     good = numbers_data(*counters, START - 77, 4)
     now = bench.entries[-1].time_ns
     gateway = bench.setup.gateway(bench.layout, START)
@@ -146,7 +154,7 @@ def test_counters_of_version_0_5_are_read() -> None:
     bench = Bench(*made(1)).live(1, 0.5)
     now = bench.entries[-1].time_ns
     replay = Replay(bench.setup.gateway(bench.layout, START))
-    counters = numbers_data(*[3] * (len(COUNTERS) - 2), START)
+    counters = numbers_data(*[3] * (len(RECORDED_COUNTERS) - 2), START)
     list(replay.follow([*bench.entries, Entry(now, EntryKind.COUNTERS, 0, counters)]))
     assert replay.rejected == 0
     assert replay.gateway.status.sent_frames == 3

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.e2e_attributes import with_data_ids
+from kontronik_can_gw.dbc.reader import NO_NODE
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Signal
@@ -270,7 +271,7 @@ def _texts(table: Any) -> str:
 
 
 def _head(message: MessageRow) -> str:
-    sender = message.senders[0] if message.senders else "Vector__XXX"
+    sender = message.senders[0] if message.senders else NO_NODE
     return f"BO_ {message.key} {message.name}: {message.length} {sender}"
 
 
@@ -283,7 +284,7 @@ def _line(signal: SignalRow) -> str:
     place = f"{signal.start}|{signal.length}@{byte_order}{sign}"
     scale = f"({_number(signal.factor)},{_number(signal.offset)})"
     limits = "|".join(map(_number, signal.limits))
-    receivers = ",".join(signal.receivers) or "Vector__XXX"
+    receivers = ",".join(signal.receivers) or NO_NODE
     unit = _escaped(signal.unit)
     return f' SG_ {name} : {place} {scale} [{limits}] "{unit}" {receivers}'
 

@@ -6,7 +6,6 @@ thread can make it. Every value in it was fresh at that moment, or is null.
 
 import json
 from collections.abc import Sequence
-from dataclasses import fields
 from enum import Enum
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -34,7 +33,7 @@ from kontronik_can_gw.runtime.status.facts import (
 )
 from kontronik_can_gw.runtime.system.clock import ClockFacts
 from kontronik_can_gw.runtime.system.process import ProcessFacts
-from kontronik_can_gw.status import UNCONFIGURED, GatewayStatus, name_in_words
+from kontronik_can_gw.status import COUNTERS, UNCONFIGURED, GatewayStatus, name_in_words
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
@@ -166,7 +165,7 @@ def _can(can: CanFacts, status: GatewayStatus) -> Document:
         "complaint": can.complaint or None,
         "restart_ms": can.restart_ms,
         "error_counters": can.error_counters,
-        "counters": {name: getattr(status, name) for name in _STATUS_COUNTERS},
+        "counters": {name: getattr(status, name) for name in COUNTERS},
     }
 
 
@@ -352,9 +351,3 @@ _UNITS = json.dumps(
 )
 """The units as text in ASCII. A document in ASCII is converted to bytes most quickly."""
 _FURTHER_COUNTERS = ("suspect_frames", "late_frames", "line_errors")
-_NO_COUNTERS = ("esc_count", "escs_ok", "started_ns", "heard_ns")
-_STATUS_COUNTERS = tuple(
-    field.name
-    for field in fields(GatewayStatus)
-    if field.type in (int, "int") and field.name not in _NO_COUNTERS
-)
