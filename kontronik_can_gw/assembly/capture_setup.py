@@ -169,7 +169,8 @@ class CaptureSetup:
             escs = tuple(esc_of(esc) for esc in header["escs"])
         core_numbers = {}
         for name, high in NUMBERS.items():
-            core_numbers[name] = whole_number(header.get(name, 0), 0, high)
+            number = header.get(name, getattr(CoreSettings, name))
+            core_numbers[name] = whole_number(number, 0, high)
         return cls(
             escs=escs,
             ports=tuple(map(str, header["ports"])),
