@@ -41,7 +41,7 @@ class Traits:
         self.by_event = SendType.EVENT in plan.send_type
         self.on_change = SendType.ON_CHANGE in plan.send_type
         self.is_paged = len(plan.pages) > 1
-        # Without a cycle, a minimum distance and further pages, time never makes it pending.
+        # Without a cycle, a minimum delay time and further groups, time never makes it pending.
         self.is_untimed = not any((plan.cycle_ns, plan.delay_ns, self.is_paged))
         self.is_silent_on_loss = settings.silent_on_loss and plan.can_stop
         counters = [signal for signal in plan.compiled if signal.role is Role.ALIVE]

@@ -190,7 +190,7 @@ def rounded(
     parts: tuple[int, int],
     intercept: Fraction = Fraction(0),
 ) -> int:
-    """Return ``count`` x ``slope`` / ``parts`` + ``intercept``, rounded once, halves up."""
+    """Return ``count`` x ``slope`` / ``parts`` + ``intercept``, rounded once, half up."""
     over, under = parts
     times, by = slope.as_integer_ratio()
     plus, of = intercept.as_integer_ratio()

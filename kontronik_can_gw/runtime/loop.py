@@ -26,7 +26,7 @@ from kontronik_can_gw.runtime.status.statistics import Statistics
 from kontronik_can_gw.runtime.system.fault_log import FaultLog, duration
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
 from kontronik_can_gw.runtime.system.worker import Handover
-from kontronik_can_gw.times import MS, SECOND
+from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.files.recorder import Recorder
@@ -192,8 +192,7 @@ class Loop:
         """
         gateway = self.gateway
         own_due = self._own_deadline()
-        # A wait is rounded up to a millisecond.
-        period = self.can.gate.quarter_ns - MS
+        period = self.can.transmitter.max_wait_ns()
         if gateway.status.is_quiet:
             period = _QUIET_PERIOD_NS
         if self._native is not None and self._native.can_run(self.can):

@@ -105,7 +105,7 @@ def compile_frame(plan: MessagePlan) -> MakeFrame:
 def _compile_page(
     plan: MessagePlan, page: int | None
 ) -> tuple[int, list[tuple[SignalPlan, Value]]]:
-    """Return a page's constant bits, and the signals with a source, each with its source."""
+    """Return a group's constant bits, and the signals with a source, each with its source."""
     constant = 0
     sources = []
     for signal in plan.signals:
@@ -129,7 +129,7 @@ def raw_value(
 ) -> int:
     """Return the raw value of a signal, or its code for an error or for "not available".
 
-    The value is multiplied first and rounded once, halves up. A true value must not be mistaken for
+    The value is multiplied first and rounded once, half up. A true value must not be mistaken for
     a code that lies within the values.
     """
     count = steps(source, esc, gateway, now)

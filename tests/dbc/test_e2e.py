@@ -218,7 +218,7 @@ def test_a_busy_bus_loses_frames_but_never_changes_their_order(
 
 
 def multiplexed() -> MessageLayout:
-    """Return a layout with a message of three pages that profile 2 protects."""
+    """Return a layout with a message of three groups that profile 2 protects."""
     signals = [
         Sig("M_CRC", 0, 8),
         Sig("M_BZ", 8, 4),

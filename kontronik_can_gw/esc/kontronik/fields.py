@@ -11,7 +11,7 @@ from kontronik_can_gw.esc.kontronik.states import Device
 
 
 class FieldRow(NamedTuple):
-    """A row of the sheet."""
+    """A row of the protocol specification."""
 
     wire: str
     """struct code of the wire type."""

@@ -40,7 +40,7 @@ class OperatingState(IntEnum):
 
     All recorded idle frames contain 12. A member is written
     ``NAME = (number, meaning, kind, phase, remedy)``, as described in ``StateText``. Its name has
-    the spelling of the sheet, which describes nothing but the names.
+    the spelling of the protocol specification, which describes nothing but the names.
     """
 
     about: StateText

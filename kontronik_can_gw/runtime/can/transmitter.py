@@ -19,7 +19,7 @@ from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.times import MS
 
 MAX_LATE_NS = 250 * MS
-"""Longest delay of a measurement. The shortest telemetry time-out may be a lower limit."""
+"""Longest delay of a measurement. The shortest telemetry timeout may be a lower limit."""
 
 
 class Transmitter:
@@ -56,7 +56,7 @@ class Transmitter:
             Act.RELEASE: self._release,
             Act.PROVE: prove,
             Act.LIMIT: self._limit,
-            Act.UNLIMIT: self._unlimit,
+            Act.UNLIMIT: lambda now: gateway.limit(False, False, now),
             Act.DROP: self._drop,
             Act.FAIL: self._fail,
             Act.ASK: self._ask,
@@ -68,8 +68,15 @@ class Transmitter:
         }
 
     def max_turn_ns(self) -> int:
-        """Return the age at which a frame is too old to be sent, counted from its turn's start."""
+        """Return the age at which a frame is too old to be sent, from the iteration's start."""
         return min(MAX_LATE_NS, self.gate.timeout_ns)
+
+    def max_wait_ns(self) -> int:
+        """Return the longest wait of the loop: a quarter of the shortest timeout of the ESCs.
+
+        It is a millisecond less, because a wait is rounded up to a millisecond.
+        """
+        return _shortest_timeout_ns(self._gateway) // 4 - MS
 
     @property
     def is_idle(self) -> bool:
@@ -126,7 +133,7 @@ class Transmitter:
         if port is None or gate.is_off:
             return None
         if gateway.is_held:
-            # Frames that are released now are sent in the next turn, at once, as in a replay.
+            # Frames that are released now are sent in the next iteration, at once, as in a replay.
             return self._send_first_frame(port, now)
         if gate.is_limited:
             return self._send_limited(port, now)
@@ -264,9 +271,6 @@ class Transmitter:
 
     def _limit(self, now: int) -> None:
         self._gateway.limit(True, self.drop_measurements(), now)
-
-    def _unlimit(self, now: int) -> None:
-        self._gateway.limit(False, False, now)
 
     def _drop(self, _now: int) -> None:
         self.drop_measurements()
