@@ -21,7 +21,7 @@ from kontronik_can_gw.capture.format import (
 from kontronik_can_gw.capture.recorded_gateway import state_of
 from kontronik_can_gw.capture.replay import SETTLE_NS, Replay, TimedFrame
 from kontronik_can_gw.desk.recordings.inputs import open_input
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import SECOND
 
 pytestmark = pytest.mark.promise("replay")
@@ -44,7 +44,7 @@ def replayed(bench: Bench, marked: bool = False) -> list[TimedFrame]:
     blocks = [b for b in found if isinstance(b, Block)]
     setup = CaptureSetup.of(read_json(blocks[0].payload))
     made_again = setup.database()
-    layout = Layout("", "", ()) if made_again is None else made_again[1]
+    layout = MessageLayout("", "", ()) if made_again is None else made_again[1]
     replay = Replay(setup.gateway(layout, START), None, marked)
     entries: list[Entry] = []
     for b in blocks[1:]:

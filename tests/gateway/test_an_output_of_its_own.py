@@ -105,8 +105,7 @@ def test_node_output_stores_parameters_and_plain_output_is_not_asked() -> None:
     assert names_of(gateway, "can0") == ["can0: memory node 5"]
 
 
-def test_a_further_output_sends_values_and_receives_commands() -> None:
-    gateway = Gateway(CoreSettings(ESCS, MessageLayout("", "", ())), 0, outputs=[VoltagesMaker()])
+def test_a_further_output_sends_values_and_receives_commands(gateway: Gateway) -> None:
     gateway.start(0)
     found = []
     for now in range(0, 4 * SECOND, SECOND // 10):
@@ -131,8 +130,7 @@ def test_a_further_output_sends_values_and_receives_commands() -> None:
     assert sent_for_left == [(second * SECOND, 0, "ffff") for second in (1, 2, 3)]
 
 
-def test_another_device_with_ids_of_a_further_output_is_noticed() -> None:
-    gateway = Gateway(CoreSettings(ESCS, MessageLayout("", "", ())), 0, outputs=[VoltagesMaker()])
+def test_another_device_with_ids_of_a_further_output_is_noticed(gateway: Gateway) -> None:
     assert gateway.receive_ids == {COMMAND_ID, FIRST_ID | EXTENDED, FIRST_ID + 1 | EXTENDED}
     gateway.receive_frame(CanFrame(FIRST_ID + 1, b"\0\0", extended=True), SECOND, SECOND)
     (conflict,) = gateway.conflicts.take()

@@ -25,7 +25,7 @@ from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import InfoData, LiveData
 from kontronik_can_gw.frames import CanFrame, block_of
 from kontronik_can_gw.gateway.gateway import Gateway
-from kontronik_can_gw.signals.plan import Layout
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
 pytestmark = pytest.mark.promise("outputs")
@@ -36,7 +36,7 @@ SETTINGS: dict[str, dict[str, object]] = {
     "dronecan": {"node_id": 42, "per_esc_nodes": True, "extended_hz": 10},
 }
 ESCS = 2
-NO_MESSAGES = Layout("", "", ())
+NO_MESSAGES = MessageLayout("", "", ())
 ONE = LiveData(battery_voltage=2400, electrical_speed=42_000, power_stage_temperature=30)
 OTHER = LiveData(battery_voltage=1800, electrical_speed=21_000, power_stage_temperature=55)
 
@@ -74,7 +74,9 @@ class SteadyBench:
 
     def __init__(self, name: str, live: LiveData = ONE, quiet_after_s: int = 0) -> None:
         setup = configured(name, quiet_after_s=quiet_after_s)
-        settings = CoreSettings(setup.escs, NO_MESSAGES, quiet_after_ns=setup.quiet_after_ns)
+        settings = CoreSettings(
+            setup.escs, NO_MESSAGES, quiet_after_ns=setup.core_numbers["quiet_after_ns"]
+        )
         self.gateway = Gateway(settings, START, outputs=setup.outputs)
         self.now = START
         self._live: bytes | None = encode(live, WireLayout.V4)
@@ -154,7 +156,7 @@ def test_a_replay_of_all_outputs_together_is_identical(quiet_after_s: int) -> No
 def check_replay(setup: CaptureSetup, seed: int) -> None:
     """Compare a run with its replay. Ports, interface and requests fail and return at random."""
     bench = Bench(setup, NO_MESSAGES).live(seed, 8)
-    assert bench.quiet_turns > 50 or not setup.quiet_after_ns
+    assert bench.quiet_turns > 50 or not setup.core_numbers["quiet_after_ns"]
     frames = [frame for frame in replayed(bench) if not frame.received]
     assert frames == bench.sent
     assert len(frames) > 10
