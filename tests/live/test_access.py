@@ -120,6 +120,18 @@ def test_too_many_pages_are_refused(page: ServedPage, monkeypatch: pytest.Monkey
     assert page.get("/events")[0] == 503
 
 
+def test_connections_that_are_kept_open_leave_room_for_others(page: ServedPage) -> None:
+    kept = []
+    for _ in range(server._MAX_CONNECTIONS):
+        sock = socket.create_connection(("127.0.0.1", page.port), timeout=20)
+        sock.sendall(b"HEAD / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert sock.recv(4096).startswith(b"HTTP/1.1 200")
+        kept.append(sock)
+    assert page.get("/")[0] == 200
+    for sock in kept:
+        sock.close()
+
+
 def test_a_used_port_is_one_clear_line(page: ServedPage) -> None:
     with pytest.raises(RunError, match=rf"--listen 127.0.0.1:{page.port}: cannot be used"):
         server.listen("127.0.0.1", page.port)

@@ -198,9 +198,9 @@ class _Limited(H11Protocol):
         sock = transport.get_extra_info("socket")
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT)
         if len(self._all) >= _MAX_CONNECTIONS:
-            # the oldest connections that have not sent a request make room, or this one does
-            waiting = [each for each in self._all if each.cycle is None]
-            oldest = min(waiting, key=lambda each: each.made, default=self)
+            # the oldest connection without a request makes room, or this one does
+            idle = [each for each in self._all if not each.cycle or each.cycle.response_complete]
+            oldest = min(idle, key=lambda each: each.made, default=self)
             oldest.transport.abort()
             self._all.discard(oldest)
             if oldest is self:
