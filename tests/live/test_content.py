@@ -81,6 +81,13 @@ def test_alarms_have_remedy_begin_and_end_and_the_newest_is_first() -> None:
     assert link["note"] == "its end is not known"
 
 
+def test_a_recording_is_named_as_one() -> None:
+    bus = FedBus(["esc1"])
+    assert json.loads(Content(bus).layout())["origin"] == ""
+    bus.is_file = True
+    assert json.loads(Content(bus).layout())["origin"] == "recording"
+
+
 def test_reset_restarts_the_extremes_and_keeps_the_plots() -> None:
     content = content_of(["esc1"], 20, options=[EscOptions(profile=FLYING)])
     high = update_of(content, 20 * S)["escs"][0]["values"][0][3]

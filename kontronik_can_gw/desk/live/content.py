@@ -148,7 +148,7 @@ class Content:
             {
                 "version": __version__,
                 "name": source.name,
-                "simulation": source.simulation,
+                "origin": "recording" if source.is_file else source.simulation,
                 "escs": [esc.name for esc in self.monitor.escs],
                 "quantities": quantities,
                 "plots": self._plots,

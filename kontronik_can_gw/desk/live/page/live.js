@@ -96,7 +96,7 @@
     if (layout && JSON.parse(text).version !== layout.version) return location.reload();
     layoutText = text;
     layout = JSON.parse(text);
-    byId("name").textContent = layout.simulation ? `${layout.name} (${layout.simulation})` : layout.name;
+    byId("name").textContent = layout.origin ? `${layout.name} (${layout.origin})` : layout.name;
     cards = layout.escs.map(makeCard);
     byId("escs").replaceChildren(...cards.map((card) => card.node));
     makePlots();
