@@ -2,26 +2,28 @@
 
     python tests/mutants/put_in_faults.py [WORDS...]
 
-WORDS select the faults whose description contains one of them. A fault can be in a Python file, in
-a C source or in a systemd unit of kontronik_can_gw. Exits with 0 if the tests detected every fault,
-else with 1 and one line for each fault that they missed or that no longer fits the code. The tests
-of a fault must pass without it: otherwise their failure says nothing. If `seen_by` names one test
-of a file ("file.py::test"), this test itself must fail: an error of a fixture or of a tool does not
-count. If the tests are slow, a run without an end does not count, either.
+WORDS select the faults whose description contains one of them. A fault names a function in a Python
+file or a C source, or a systemd unit, and a small edit of it. Exits with 0 if the tests detected
+every fault, else with 1 and one line for each fault that they missed or that no longer fits the
+code. The tests of a fault must pass without it: otherwise their failure says nothing. If `seen_by`
+names one test of a file ("file.py::test"), this test itself must fail: an error of a fixture or of
+a tool does not count. If the tests are slow, a run without an end does not count, either.
 """
 
 import argparse
+import ast
 import os
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-import textwrap
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 PROJECT = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_name("faults.toml")
@@ -30,44 +32,46 @@ FAILED = 1
 """The exit code of pytest if a test failed. Any other code proves nothing."""
 SLOW = ("tests/proofs", "tests/plug")
 """Tests that need minutes. If they do not end in time, that says nothing about a fault."""
-SUFFIXES = (".py", ".c", ".h", ".service")
-"""The kinds of files that can have a fault."""
 IN_C = (".c", ".h")
+WHITE = r"(?:\s|/\*.*?\*/)+"
+"""White space and comments of C."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Fault:
     what: str
-    search: str
+    place: str
+    """A file below kontronik_can_gw, or "file: function", or "file: Class.method"."""
+    find: str
+    """An expression or statements of that place. In C and units: a text of that place."""
     replace: str
-    seen_by: tuple[str, ...]
+    seen_by: tuple[str, ...] = ()
+    nth: int = 0
+    """The number of the occurrence, from 1. 0: there must be only one."""
 
     def put_in(self, project: Path = PROJECT) -> tuple[Path, str]:
-        """Return the file and its text with the fault. ValueError if it does not fit the code."""
-        # any white space may be between the words
-        pattern = re.compile(r"\s+".join(map(re.escape, self.search.split())))
-        folder = project / "kontronik_can_gw"
-        found = []
-        for file in folder.rglob("*"):
-            if file.suffix in SUFFIXES:
-                found += [(file, match) for match in pattern.finditer(file.read_text())]
-        if len(found) != 1:
+        """Return the file and its text with the fault. ValueError if it does not fit the code.
+
+        In Python, syntax trees are compared, so comments, docstrings and line ends do not count. In
+        C and in units, white space and comments do not count.
+        """
+        name, _, function = self.place.partition(": ")
+        file = project / "kontronik_can_gw" / name
+        if not file.is_file():
+            raise ValueError(f"{name} does not exist")
+        edit = changed_python if file.suffix == ".py" else changed_text
+        return file, edit(file.read_text(encoding="utf-8"), function, self)
+
+    def chosen(self, found: Sequence[T]) -> T:
+        """Return the occurrence that is meant."""
+        if self.nth > len(found) or (not self.nth and len(found) != 1):
+            wanted = f"number {self.nth}" if self.nth else "exactly one"
             raise ValueError(
-                f"its text is in {len(found)} places instead of one: "
-                "write it again for the present code"
+                f"{self.place}: {len(found)} places have `{self.find.strip()}`, and {wanted} is "
+                "needed. Write the fault for the present code."
             )
-        file, match = found[0]
-        text = match.string
-        line_start = text.rfind("\n", 0, match.start()) + 1
-        margin = " " * (match.start() - line_start)
-        put_in = textwrap.indent(self.replace.strip("\n"), margin).removeprefix(margin)
-        changed = text[: match.start()] + put_in + text[match.end() :]
-        if file.suffix == ".py":
-            try:
-                compile(changed, file.name, "exec")
-            except SyntaxError as error:
-                raise ValueError(f"with it {file.name} is no Python: {error}") from None
-        return file, changed
+        return found[self.nth - 1]
 
     def control(self, copy: Path) -> str:
         """Return why the tests prove nothing, or "" if they pass without the fault."""
@@ -96,6 +100,82 @@ class Fault:
             if is_in_c:
                 is_compiled(copy)
         return "" if code == FAILED else f"NOT CAUGHT (pytest: {code})"
+
+
+def changed_python(text: str, function: str, fault: Fault) -> str:
+    """Return Python code with the fault in a function."""
+    tree = ast.parse(text)
+    scope: ast.AST = tree
+    for name in filter(None, function.split(".")):
+        inside = [each for each in ast.walk(scope) if getattr(each, "name", "") == name]
+        if not inside:
+            raise ValueError(f"{fault.place}: there is no {name}")
+        scope = inside[0]
+    wanted = ast.parse(fault.find.strip()).body
+    replacement = ast.parse(fault.replace.strip()).body
+    if len(wanted) == 1 and isinstance(wanted[0], ast.Expr):
+        expression = wanted[0].value
+        found = _equal_expressions(scope, expression)
+        if found and isinstance(replacement[0], ast.Expr) and len(replacement) == 1:
+            parent, key, index = fault.chosen(found)
+            _put(parent, key, index, replacement[0].value)
+            return ast.unparse(tree)
+    body, start = fault.chosen(_equal_statements(scope, wanted))
+    body[start : start + len(wanted)] = replacement
+    return ast.unparse(ast.fix_missing_locations(tree))
+
+
+def _equal_expressions(scope: ast.AST, wanted: ast.expr) -> list[tuple[ast.AST, str, int | None]]:
+    """Return the places of expressions that are equal, in the order of the text."""
+    dumped = ast.dump(wanted)
+    found: list[tuple[int, int, ast.AST, str, int | None]] = []
+    for parent in ast.walk(scope):
+        for key, value in ast.iter_fields(parent):
+            children = list(enumerate(value)) if isinstance(value, list) else [(None, value)]
+            for index, child in children:
+                if isinstance(child, type(wanted)) and ast.dump(child) == dumped:
+                    found.append((child.lineno, child.col_offset, parent, key, index))
+    found.sort(key=lambda each: each[:2])
+    return [(parent, key, index) for _, _, parent, key, index in found]
+
+
+def _put(parent: ast.AST, key: str, index: int | None, node: ast.expr) -> None:
+    """Put an expression into the tree."""
+    if index is None:
+        setattr(parent, key, node)
+    else:
+        getattr(parent, key)[index] = node
+
+
+def _equal_statements(
+    scope: ast.AST, wanted: Sequence[ast.stmt]
+) -> list[tuple[list[ast.stmt], int]]:
+    """Return the lists of statements, and the positions in them, that have these statements."""
+    dumped = [ast.dump(each) for each in wanted]
+    found = []
+    for parent in ast.walk(scope):
+        for _, value in ast.iter_fields(parent):
+            if isinstance(value, list) and value and isinstance(value[0], ast.stmt):
+                texts = [ast.dump(each) for each in value]
+                for start in range(len(value) - len(wanted) + 1):
+                    if texts[start : start + len(wanted)] == dumped:
+                        found.append((value[start].lineno, value, start))
+    found.sort(key=lambda each: each[0])
+    return [(value, start) for _, value, start in found]
+
+
+def changed_text(text: str, function: str, fault: Fault) -> str:
+    """Return the text of a C source or a unit with the fault in a function."""
+    start, end = 0, len(text)
+    if function:
+        head = re.search(rf"^\w[^;{{}}=]*?\b{function}\([^;{{}}]*?\)\s*\{{", text, re.MULTILINE)
+        if head is None:
+            raise ValueError(f"{fault.place}: there is no {function}")
+        start = head.start()
+        end = text.index("\n}", head.end())
+    pattern = re.compile(WHITE.join(map(re.escape, fault.find.split())))
+    match = fault.chosen(list(pattern.finditer(text, start, end)))
+    return text[: match.start()] + fault.replace.strip("\n") + text[match.end() :]
 
 
 def is_compiled(copy: Path) -> bool:
@@ -151,10 +231,11 @@ def faults(path: Path = LIST) -> list[Fault]:
     """Return the faults of a list. ValueError if one of them is incomplete."""
     listed = tomllib.loads(path.read_text())["fault"]
     for number, each in enumerate(listed):
-        if set(each) != {"what", "search", "replace", "seen_by"} or not each["seen_by"]:
+        needed = {"what", "place", "find", "replace", "seen_by"}
+        if set(each) - {"nth"} != needed or not each["seen_by"]:
             raise ValueError(
-                f"{path.name}: fault {number + 1} needs what, search, replace, seen_by, "
-                "and nothing else"
+                f"{path.name}: fault {number + 1} needs what, place, find, replace, seen_by, "
+                "and perhaps nth"
             )
     return [Fault(**each | {"seen_by": tuple(each["seen_by"])}) for each in listed]
 

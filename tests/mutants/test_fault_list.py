@@ -1,5 +1,6 @@
 """The list of faults fits the present code, and only a failure due to a fault detects it."""
 
+import ast
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,78 @@ from put_in_faults import PROJECT, Fault, faults
 pytestmark = pytest.mark.promise("sharp-tests")
 
 
+def without_layout(file: Path) -> str:
+    """Return the text of a file. Python is written from its syntax tree, as faults are."""
+    text = file.read_text(encoding="utf-8")
+    return ast.unparse(ast.parse(text)) if file.suffix == ".py" else text
+
+
+PLAIN = """
+class Port:
+    def read(self, now):
+        \"\"\"Read.\"\"\"
+        if now - self.last > self.timeout:
+            return b""
+        return self.take(now)
+"""
+REWORDED = """
+class Port:
+    \"\"\"A port.\"\"\"
+
+    def read(self, now: int) -> bytes:
+        \"\"\"Return the bytes of the port.\"\"\"
+        if (
+            now - self.last  # the pause
+            > self.timeout
+        ):
+            return b""
+        return self.take(now)
+"""
+
+
+@pytest.mark.parametrize("text", [PLAIN, REWORDED], ids=["plain", "reworded"])
+@pytest.mark.parametrize(
+    ("find", "replace", "changed"),
+    [
+        ("self.timeout", "2 * self.timeout", "> 2 * self.timeout:"),
+        ("self.take(now)", "b''", "return b''"),
+        ("return self.take(now)", "now = 0\nreturn self.take(now)", "now = 0"),
+    ],
+)
+def test_comments_docstrings_and_line_ends_do_not_count(
+    text: str, find: str, replace: str, changed: str
+) -> None:
+    fault = Fault("", "port.py: Port.read", find, replace)
+    assert changed in put_in_faults.changed_python(text, "Port.read", fault)
+
+
+def test_a_comment_and_white_space_in_c_do_not_count() -> None:
+    text = "static int f(int a)\n{\n    return a /* bytes */\n        + 1;\n}\n"
+    fault = Fault("", "core.c: f", "return a + 1;", "return a + 2;")
+    assert "return a + 2;" in put_in_faults.changed_text(text, "f", fault)
+
+
+@pytest.mark.parametrize(
+    ("function", "find", "nth", "problem"),
+    [
+        ("Port.write", "now", 0, "there is no write"),
+        ("Port.read", "now", 0, "2 places have `now`, and exactly one is needed"),
+        ("Port.read", "now", 3, "2 places have `now`, and number 3 is needed"),
+        ("Port.read", "later", 0, "0 places have `later`"),
+    ],
+)
+def test_a_fault_that_does_not_fit_names_its_place(
+    function: str, find: str, nth: int, problem: str
+) -> None:
+    fault = Fault("", f"port.py: {function}", find, "0", nth=nth)
+    with pytest.raises(ValueError, match=problem):
+        put_in_faults.changed_python(PLAIN, function, fault)
+
+
 @pytest.mark.parametrize("fault", faults(), ids=lambda fault: fault.what)
 def test_each_fault_of_the_list_can_be_put_in(fault: Fault) -> None:
     file, changed = fault.put_in()
-    assert changed != file.read_text()
+    assert changed not in (file.read_text(), without_layout(file))
     for tests in fault.seen_by:
         path, _, name = tests.partition("::")
         assert (PROJECT / path).exists()

@@ -215,9 +215,10 @@ class PlanFault:
 def plan_faults() -> list[PlanFault]:
     found = []
     for each in tomllib.loads(LIST.read_text())["fault"]:
-        fault = Fault(each["what"], each["search"], each["replace"], ())
-        dbc, keys = each.get("dbc", ""), each.get("keys", "")
-        found.append(PlanFault(fault, each["refuted_as"], dbc, keys))
+        refuted_as = each.pop("refuted_as")
+        dbc = each.pop("dbc", "")
+        keys = each.pop("keys", "")
+        found.append(PlanFault(Fault(**each), refuted_as, dbc, keys))
     return found
 
 
