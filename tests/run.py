@@ -75,6 +75,8 @@ LIMIT_AS_STEP = "--timeout=0 -o faulthandler_timeout=0"
 LIMIT_OF_VCAN = "--timeout=20000 -o faulthandler_timeout=0"
 """In virtual time, which passes at once while a test waits."""
 PYTEST = "python -m pytest -q --junitxml={report}"
+SIDE_BY_SIDE = "-n logical --maxprocesses=8 --dist worksteal"
+"""Each process has neighbouring tests, so that a set-up of a file is rarely made twice."""
 ON_VCAN = (
     "KCG_VCAN=1 HYPOTHESIS_STORAGE_DIRECTORY={scratch} "
     "python tests/vm/vm_run.py --timeout=1500 --rw={scratch} -- "
@@ -97,12 +99,12 @@ PLUG = (
 STEPS = {
     "lint": "ruff check . && ruff format --check .",
     "types": "mypy",
-    "unit": f"{PYTEST} -n logical --maxprocesses=8 -m 'not extended' {ELSEWHERE} {{args}}",
+    "unit": f"{PYTEST} {SIDE_BY_SIDE} -m 'not extended' {ELSEWHERE} {{args}}",
     "vcan": f"{ON_VCAN} -m 'not extended' {{args}}",
     "faults": FAULTS.format("uml"),
     "tools": f"{PYTEST} {LIMIT_OF_TOOLS} -m 'extended or rights' {ELSEWHERE} {{args}}",
     "masters": f"{ON_VCAN} -m extended {{args}}",
-    "prove": f"{PYTEST} -n 2 tests/proofs {{args}}",
+    "prove": f"{PYTEST} -n 2 --dist worksteal tests/proofs {{args}}",
     "cuts": PLUG.format(200),
     "plug": PLUG.format(10_000),
     "qemu": FAULTS.format("qemu"),

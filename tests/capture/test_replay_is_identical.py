@@ -101,7 +101,7 @@ def test_a_replay_that_begins_in_quiet_mode_is_quiet_at_once() -> None:
     assert {each.frame.can_id for each in frames} == {each.frame.can_id for each in bench.sent}
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("is_wild", [False, True])
 def test_messages_of_a_later_part_alone_are_exact_once_it_has_settled(
     seed: int,

@@ -1,6 +1,7 @@
 """The same mistake has the same exit code in every command, and one line that names the file."""
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -83,11 +84,17 @@ def folder(tmp_path: Path, recording: bytes, monkeypatch: pytest.MonkeyPatch) ->
     return tmp_path
 
 
+@cache
+def import_modules() -> None:
+    """Import modules while they can be read. Once is enough for all tests."""
+    for words in ("describe", "convert x.bin - --to csv", "replay x.bin --on pty --delay 0"):
+        run(*words.split())
+
+
 @pytest.fixture
 def no_rights(folder: Path) -> Iterator[None]:
     """Run a command while nothing in the folder can be opened or created."""
-    for words in ("describe", "convert x.bin - --to csv", "replay x.bin --on pty --delay 0"):
-        run(*words.split())  # imports modules while they can be read
+    import_modules()
     for path in folder.iterdir():
         path.chmod(0)
     folder.chmod(0o555)

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.promise("one-line")
 
 SEED = 41
 COUNT = 2000
-PARTS = 8
+PARTS = 4
 
 
 @pytest.fixture

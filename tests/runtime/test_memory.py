@@ -24,7 +24,7 @@ from kontronik_can_gw.times import MS, SECOND
 
 pytestmark = pytest.mark.promise("memory")
 
-LIVE_EACH = 20 * MS
+LIVE_EACH = 40 * MS
 EVENTS_A_SECOND = 2 * (SECOND // LIVE_EACH + 1)
 """Live and info frames of two ESCs in a second."""
 ONCE = 60
@@ -109,6 +109,6 @@ def test_a_thousand_events_leave_no_allocation(
     assert sent > 10_000
     assert len(collected) == 3, "one a minute"
     thousands = COLLECT_NS // SECOND * EVENTS_A_SECOND // 1000
-    assert thousands >= 6
+    assert thousands >= 3
     growth = collected[2] - collected[1]
     assert growth < ONCE, f"{growth} blocks in {thousands} 000 events"
