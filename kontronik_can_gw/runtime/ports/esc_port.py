@@ -311,9 +311,8 @@ class EscLog:
             conditions.forget(self._quality_condition)
         if esc.link not in (LinkState.OK, LinkState.DEGRADED):
             return
-        if (
-            is_hidden_loss
-        ):  # it began and ended while the process was suspended, or in one iteration
+        # It began and ended while the process was suspended, or in one iteration.
+        if is_hidden_loss:
             text = (
                 f"{name}: telemetry was lost for a moment; its values were marked as not available"
             )
