@@ -13,7 +13,9 @@ from recordings import capture_bytes
 from report_browser import MISSING, PROGRAM, Browser
 from simulated_bus import FLYING, Timed, flight, with_errors
 
+from kontronik_can_gw.desk.live.content import Content
 from kontronik_can_gw.desk.live.flights import Flights
+from kontronik_can_gw.desk.monitor.model import Esc, Quantity
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.times import SECOND as S
@@ -257,6 +259,28 @@ def test_nothing_is_cut_off_or_scrolls_sideways(
             plots = browser.run("live.view().plots.map((p) => p.u.width)")
             assert max(plots) <= width
         assert browser.errors == []
+
+
+@pytest.mark.parametrize("count", [1, 8])
+@pytest.mark.parametrize("width", [360, 768, 1440])
+def test_large_values_stay_within_their_figure(
+    browser: Browser, count: int, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def large_value(_content: Content, _esc: Esc, quantity: Quantity, _now: int) -> tuple[Any, ...]:
+        value = -183_502.4 if quantity.digits < 2 else -100.25
+        return round(value, quantity.digits), None, value, value, ""
+
+    monkeypatch.setattr(Content, "_value", large_value)
+    bus = FedBus([f"motor_{number}" for number in range(count)])
+    with ServedPage(bus) as page:
+        fly(bus, 3)
+        browser.open(page.url, width, 800, phone=width == 360, ready=READY)
+        wait_for_updates(browser)
+        browser.run("document.querySelectorAll('.more').forEach((each) => { each.open = true; })")
+        outside = """[...document.querySelectorAll('.figure')].filter((figure) =>
+          figure.getClientRects().length && figure.scrollWidth > figure.clientWidth)
+          .map((figure) => figure.innerText)"""
+        assert browser.run(outside) == []
 
 
 def test_a_page_has_no_errors_of_the_page_before(browser: Browser) -> None:

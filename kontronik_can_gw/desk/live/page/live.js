@@ -6,6 +6,7 @@
   const RETRY_MS = 5000;
   const DRIFT = 0.0005;
   const SPEAK_MS = 10000;
+  const LONG = 7; // a figure with more characters is shown smaller
   const COMMAND = { headers: { "X-Kontronik-Page": "1" }, cache: "no-store" };
   const ICONS = { ok: "/static/icon.svg", error: "/static/icon-error.svg", offline: "/static/icon-offline.svg" };
   let layout = null;
@@ -178,11 +179,13 @@
       const [value, age, low, high, mark] = given ?? [null, null, null, null, ""];
       const isOld = value === null || age !== null;
       const isBeyond = !isOld && isBeyondLimit(name, value);
-      put(figure.number, shown(value, digits));
-      let text = low === null ? "" : `${shown(low, digits)} … ${shown(high, digits)}`;
-      if (isOld) text = value === null ? "not available" : `${ageText(age)} old`;
-      put(figure.range, text);
-      figure.node.className = ["figure", mark, isOld ? "old" : "", isBeyond ? "beyond" : ""].filter(Boolean).join(" ");
+      const text = shown(value, digits);
+      put(figure.number, text);
+      let range = low === null ? "" : `${shown(low, digits)} … ${shown(high, digits)}`;
+      if (isOld) range = value === null ? "not available" : `${ageText(age)} old`;
+      put(figure.range, range);
+      const kinds = { old: isOld, beyond: isBeyond, long: text.length > LONG };
+      figure.node.className = ["figure", mark, ...Object.keys(kinds).filter((kind) => kinds[kind])].join(" ");
       warn(`${index} ${name}`, isBeyond);
     });
   }
