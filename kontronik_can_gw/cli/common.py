@@ -1,11 +1,13 @@
 """Functions of several commands: the log, signals, and warnings about a configuration."""
 
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Timer
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.assembly.assemble import Loaded, load_configuration
@@ -18,6 +20,9 @@ from kontronik_can_gw.errors import UserError
 if TYPE_CHECKING:
     from kontronik_can_gw.canopen.setup import CanopenSetup
     from kontronik_can_gw.runtime.files.store import ParameterStore
+
+_REPEAT_AFTER_S = 0.01
+"""Time until a signal that arrived in a finalizer is sent again."""
 
 
 def load_all(path: Path, store: "Callable[[Path], ParameterStore] | None" = None) -> Loaded:
@@ -71,7 +76,8 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[list[str]]:
     """Call ``stop`` for SIGTERM, SIGINT and SIGHUP. A second signal ends the process at once.
 
     Under nohup SIGHUP stays ignored. Yields a list that contains the signal's name after a signal
-    was received.
+    was received. ``stop`` may raise KeyboardInterrupt. A signal can arrive in a finalizer, for
+    which Python only prints exceptions. The signal is then sent again.
     """
     received: list[str] = []
     numbers = [signal.SIGTERM, signal.SIGINT]
@@ -84,10 +90,26 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[list[str]]:
         received.append(signal.Signals(received_number).name)
         stop()
 
+    def repeat(unraisable: "sys.UnraisableHookArgs") -> None:
+        if not (received and isinstance(unraisable.exc_value, KeyboardInterrupt)):
+            hook(unraisable)
+            return
+        for number in numbers:
+            signal.signal(number, end)
+        number = signal.Signals[received.pop()]
+        timers.append(Timer(_REPEAT_AFTER_S, os.kill, (os.getpid(), number)))
+        timers[-1].start()
+
+    hook = sys.unraisablehook
+    timers: list[Timer] = []
     before = {number: signal.signal(number, end) for number in numbers}
+    sys.unraisablehook = repeat
     try:
         yield received
     finally:
+        for timer in timers:
+            timer.cancel()
+        sys.unraisablehook = hook
         for number, old in before.items():
             signal.signal(number, old)
 

@@ -5,6 +5,7 @@ import re
 import sys
 from argparse import ArgumentTypeError
 from threading import Event
+from typing import IO
 
 from kontronik_can_gw.cli.arguments import FORCE, number_from, option
 from kontronik_can_gw.cli.common import stopping_on_signals
@@ -176,20 +177,29 @@ def _to_files(escs: list[SimulatedEsc], output: str, time_ns: int, *, force: boo
     for name in names:
         check_output(name, (), force=force)
     for number, (esc, name) in enumerate(zip(escs, names, strict=True), 1):
-        total = 0
-        frames = 0
         with writing(name, force=force) as out:
-            file = out.open()
-            now = esc.next_ns
-            end = now + time_ns
-            while now < end:  # steps of a minute limit the memory, even for a year
-                now = min(now + 60 * SECOND, end)
-                for sent in esc.frames_until(now - 1):
-                    file.write(sent.wire)
-                    total += len(sent.wire)
-                    frames += 1
+            frames, total = _write_frames(esc, out.open(), time_ns)
             out.is_whole = True
         print(f"esc{number}: {frames} frames, {total} bytes to {name}", file=sys.stderr)
+
+
+def _write_frames(esc: SimulatedEsc, file: IO[bytes], time_ns: int) -> tuple[int, int]:
+    """Write the bytes that an ESC sends within a time. Return the numbers of frames and bytes.
+
+    The loop is not in a ``with`` block: Python 3.13 leaves such a block without its ``__exit__`` if
+    a signal arrives as a ``while`` loop repeats.
+    """
+    frames = 0
+    total = 0
+    now = esc.next_ns
+    end = now + time_ns
+    while now < end:  # steps of a minute limit the memory, even for a year
+        now = min(now + 60 * SECOND, end)
+        for sent in esc.frames_until(now - 1):
+            file.write(sent.wire)
+            total += len(sent.wire)
+            frames += 1
+    return frames, total
 
 
 def _to_terminals(escs: list[SimulatedEsc], link: str | None, time_ns: int | None) -> None:

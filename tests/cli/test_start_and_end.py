@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 
 from kontronik_can_gw import cli
+from kontronik_can_gw.cli.common import stopping_on_signals
+from kontronik_can_gw.cli.output import interrupt
 
 pytestmark = pytest.mark.promise("closed-ends")
 
@@ -177,3 +179,24 @@ def test_a_signal_ends_a_gateway_that_waits_for_its_configuration(
         if writer is not None:
             os.close(writer)
     assert (process.returncode, said) == (0, "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_that_arrives_in_a_finalizer_still_ends_the_command(
+    number: signal.Signals, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Python ignores an exception there, so the signal would be lost."""
+
+    class Finalized:
+        def __del__(self) -> None:
+            signal.raise_signal(number)
+
+    def wait() -> None:
+        with stopping_on_signals(interrupt):
+            Finalized()
+            time.sleep(60)
+            pytest.fail("the signal was lost")
+
+    with pytest.raises(KeyboardInterrupt):
+        wait()
+    assert capfd.readouterr().err == ""
