@@ -29,6 +29,7 @@ from kontronik_can_gw.gateway.gate_table import (
     SOON_NS,
     UNLIMITED,
     WORKED_NS,
+    Act,
     Row,
     State,
 )
@@ -46,6 +47,8 @@ _SHUT = (State.CLOSED, State.OPENING, State.LOST)
 
 Step = Callable[[Gate, int], None]
 Key = tuple[object, ...]
+Path = tuple[tuple[int, str], ...]
+"""Times and names of events."""
 
 
 class NotedGate(Gate):
@@ -216,7 +219,7 @@ _UNCOUNTED: dict[str, Step] = {
 }
 
 
-def events_of(gate: Gate, now: int) -> Iterator[tuple[str, Step]]:
+def events_of(gate: NotedGate, now: int) -> Iterator[tuple[str, Step]]:
     """Yield the events that are possible in a state."""
     yield from _OF_ALL.items()
     if gate.state in _SHUT:
@@ -229,16 +232,39 @@ def events_of(gate: Gate, now: int) -> Iterator[tuple[str, Step]]:
     yield from (_OF_COUNT if gate.under_way.count else _UNCOUNTED).items()
     if gate.state is State.SLOW:
         yield from _OF_SLOW.items()
-    has_room = gate.room(now) and gate.may_try(now)
-    if gate.wants_first_frame(now):
-        yield "first frame", lambda gate, now: gate.accepted_first(now)
-        yield "no first frame", lambda gate, now: gate.no_first_frame(now)
-    if gate.wants_first_frame(now) or has_room:
-        yield "busy", lambda gate, now: gate.refused(False, now)
-        yield "full", lambda gate, now: gate.refused(True, now)
+    yield from _handed_over(gate, now)
+
+
+def _handed_over(gate: NotedGate, now: int) -> Iterator[tuple[str, Step]]:
+    """Yield the events of frames that may be handed over. The owner lets time pass first."""
+    ready = clone(gate)
+    ready.rows = []
+    ready.advance(now)
+    has_room = ready.room(now) and ready.may_try(now)
+    if ready.wants_first_frame(now):
+        yield "first frame", _after_time(lambda gate, now: _accept_first(gate, 0, now))
+        yield "first frame waits", _after_time(lambda gate, now: _accept_first(gate, 1, now))
+        yield "no first frame", _after_time(lambda gate, now: gate.no_first_frame(now))
+    if ready.wants_first_frame(now) or has_room:
+        yield "busy", _after_time(lambda gate, now: gate.refused(False, now))
+        yield "full", _after_time(lambda gate, now: gate.refused(True, now))
     if has_room:
-        frames = min(gate.room(now), FRAMES)
-        yield "accepted", lambda gate, now: gate.accepted(frames, now)
+        frames = min(ready.room(now), FRAMES)
+        yield "accepted", _after_time(lambda gate, now: gate.accepted(frames, now))
+
+
+def _accept_first(gate: Gate, queued: int, now: int) -> None:
+    """Accept the first frame, and look, as the owner does."""
+    gate.accepted_first(now)
+    gate.look(gate.under_way.count, queued, now)
+
+
+def _after_time(step: Step) -> Step:
+    def advance_and_step(gate: Gate, now: int) -> None:
+        gate.advance(now)
+        step(gate, now)
+
+    return advance_and_step
 
 
 @dataclass
@@ -249,6 +275,14 @@ class Found:
     now: int
     row: Row | None = None
     """The last row that was followed."""
+    before: "Found | None" = None
+    event: str = ""
+    """The event that led to the state."""
+
+    @property
+    def path(self) -> Path:
+        """The events from the beginning to this state."""
+        return () if self.before is None else (*self.before.path, (self.now, self.event))
 
 
 @dataclass
@@ -257,8 +291,10 @@ class Exploration:
 
     states: set[Key] = field(default_factory=set)
     transitions: int = 0
-    rows: set[Row] = field(default_factory=set)
-    pairs: set[tuple[Row, Row]] = field(default_factory=set)
+    rows: dict[Row, Path] = field(default_factory=dict)
+    """The rows that were followed, with a shortest path to each."""
+    pairs: dict[tuple[Row, Row], Path] = field(default_factory=dict)
+    """The pairs of rows that were followed in a row, with a shortest path to each."""
     is_complete: bool = False
 
 
@@ -280,21 +316,29 @@ def explore(
         after = min(ahead, default=now + 1)
         suspended = max(ahead, default=now) + 1
         for at in sorted({now, after - 1, after, after + 1, suspended}):
-            for _, step in events_of(gate, at):
+            for event, step in events_of(gate, at):
                 next_gate = clone(gate)
                 rows.clear()
                 step(next_gate, at)
                 next_gate.advance(at)
                 check(next_gate, at)
+                if Act.WORKED in next_gate.acts:
+                    next_gate.restart.count = 0  # as the owner does
                 result.transitions += 1
-                result.rows.update(rows)
-                followed = [found.row, *rows] if found.row else rows
-                result.pairs.update(pairwise(followed))
+                followed = [found.row, *rows] if found.row else rows.copy()
+                last = followed[-1] if followed else None
+                each = Found(next_gate, at, last, found, event)
+                for row in rows:
+                    if row not in result.rows:
+                        result.rows[row] = each.path
+                for pair in pairwise(followed):
+                    if pair not in result.pairs:
+                        result.pairs[pair] = each.path
                 key = key_of(next_gate, at)
                 if key not in result.states:
                     next_gate.acts.clear()
                     result.states.add(key)
-                    queue.append(Found(next_gate, at, followed[-1] if followed else None))
+                    queue.append(each)
                     recover(clone(next_gate), at)
     result.is_complete = not queue
     return result

@@ -81,7 +81,7 @@ def explore_and_report(most: int) -> Exploration:
 
 @pytest.mark.promise("unstoppable")
 def test_states_within_few_events_keep_the_invariants() -> None:
-    assert len(explore_and_report(3000).rows) >= 55
+    assert explore_and_report(3000).rows.keys() == set(TABLE)
 
 
 @pytest.mark.promise("unstoppable")
@@ -89,7 +89,7 @@ def test_states_within_few_events_keep_the_invariants() -> None:
 def test_all_states_that_can_be_reached_keep_the_invariants() -> None:
     found = explore_and_report(1_000_000)
     assert found.is_complete
-    assert found.rows == set(TABLE), [row for row in TABLE if row not in found.rows]
+    assert found.rows.keys() == set(TABLE), [row for row in TABLE if row not in found.rows]
 
 
 def test_a_count_of_0_blocks_nothing() -> None:
