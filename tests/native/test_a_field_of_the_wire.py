@@ -107,7 +107,7 @@ def test_new_field_is_in_both_cores_and_in_the_export(
     fields = copy / "esc" / "kontronik" / "fields.py"
     text = fields.read_text(encoding="utf-8")
     assert text.count(before) == 1
-    row = f'Row("{type_code}", "V", 10, note="new")'
+    row = f'FieldRow("{type_code}", "V", 10, note="new")'
     text = text.replace(before, f"    dummy: Annotated[int, {row}] = 0\n{before}")
     fields.write_text(text, encoding="utf-8")
 
