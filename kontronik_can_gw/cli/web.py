@@ -130,16 +130,17 @@ def _announce(source: Source, address: "Address") -> None:
     """Print the page's addresses. The token is printed only on a terminal, not in a log."""
     if source.problem:
         say(f"warning: {source.problem}")
-    is_public = not ipaddress.ip_address(address.host).is_loopback
     is_terminal = sys.stderr.isatty()
     shown = address if is_terminal else address._replace(is_open=True)
     for url in shown.urls():
         say(f"{url} shows {source.name}")
-    if is_public and address.is_open:
+    if ipaddress.ip_address(address.host).is_loopback:
+        return
+    if address.is_open:
         say("warning: --no-token: everybody in the network can see the page")
-    elif is_public and is_terminal:
+    elif is_terminal:
         _print_code(address, sys.stderr)
-    elif is_public:
+    else:
         say("a browser needs the token. Type: kontronik-can-gw web --address")
 
 

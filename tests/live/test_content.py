@@ -81,6 +81,20 @@ def test_alarms_have_remedy_begin_and_end_and_the_newest_is_first() -> None:
     assert link["note"] == "its end is not known"
 
 
+def test_the_large_figures_begin_with_speed_and_end_with_temperatures() -> None:
+    quantities = json.loads(content_of(["esc1"], 1).layout())["quantities"]
+    assert [each["source"] for each in quantities if each["isLarge"]] == [
+        "motor_speed",
+        "battery_voltage",
+        "battery_current",
+        "battery_power",
+        "energy_used",
+        "power_stage_temperature",
+        "bec_temperature",
+    ]
+    assert [each["isLarge"] for each in quantities[:8]] == [True] * 7 + [False]
+
+
 def test_a_recording_is_named_as_one() -> None:
     bus = FedBus(["esc1"])
     assert json.loads(Content(bus).layout())["origin"] == ""

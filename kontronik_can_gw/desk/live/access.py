@@ -188,9 +188,7 @@ class Address(NamedTuple):
             token = str(content["token"])
             ipaddress.ip_address(content["host"])
             return cls(content["host"], int(content["port"]), token, bool(content["is_open"]))
-        except FileNotFoundError:
-            return None
-        except (ValueError, LookupError, TypeError):
+        except (FileNotFoundError, ValueError, LookupError, TypeError):
             return None
 
     @classmethod

@@ -36,7 +36,7 @@ _LARGE = (
     "power_stage_temperature",
     "bec_temperature",
 )
-"""The values in large figures. The first speed in the DBC replaces all speeds."""
+"""The values in large figures, in their order. The first speed in the DBC replaces all speeds."""
 _PLOTTED = {"battery_voltage": 1, "current": 1, "power": 1, "speed": 1, "temperature": 2}
 """Keys of the report's plots that the page has, and the number of their lines.
 
@@ -64,8 +64,8 @@ class Content:
             each for each in QUANTITIES if any(esc.has(each.source) for esc in self.monitor.escs)
         ]
         hidden = [each.source for each in known if each.unit == "1/min"][1:]
-        self._large = [source for source in _LARGE if source not in hidden]
-        self._quantities = sorted(known, key=lambda each: each.source not in self._large)
+        self._large = {name: place for place, name in enumerate(_LARGE) if name not in hidden}
+        self._quantities = sorted(known, key=lambda each: self._large.get(each.source, len(_LARGE)))
         """The quantities in the DBC, those in large figures first."""
         self._plots: list[dict[str, Any]] = []
         self._lines: list[tuple[Esc, Quantity]] = []
