@@ -17,6 +17,7 @@ import stat
 import sys
 import time
 from collections.abc import AsyncIterator
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,7 +98,7 @@ def recordings_in(folder: Path) -> list[Recording]:
         size = sum(status.st_size for _, status in parts)
         changed_ns = max(status.st_mtime_ns for _, status in parts)
         found.append(Recording(name, paths, size, changed_ns))
-    return sorted(found, key=lambda each: (each.changed_ns, each.name), reverse=True)
+    return sorted(found, key=attrgetter("changed_ns", "name"), reverse=True)
 
 
 class Flights:
