@@ -63,21 +63,21 @@ class Emergencies:
         """Present errors in the order in which they began."""
         self._unreported: dict[PresentError, None] = {}
         """Errors that began while no emergencies could be sent."""
-        self._last_is_error = False
+        self._is_last_an_error = False
         """True if the last emergency sent was an error, not 0000h."""
         self._pending: deque[tuple[PresentError | None, bytes]] = deque(maxlen=_MAX_PENDING)
         self._delayed: list[tuple[int, PresentError, bytes]] = []
         """Time, condition and data of emergencies that ``advance`` sorts and reports."""
         self._delayed_since = NEVER
         """Time since which emergencies are delayed. NEVER if they are not."""
-        self._open = False
+        self._is_open = False
         self._last_ns = -NEVER
         self.is_quiet = False
         """True if no emergencies are sent: in quiet mode, or because no frame may leave.
 
         ``repeat`` sends them afterwards.
         """
-        self._had_error = False
+        self._has_had_error = False
         """True if there was an error since the last reset."""
         self._bind_objects()
 
@@ -171,7 +171,7 @@ class Emergencies:
             detail = own_detail
         condition = PresentError(code, FROM_GATEWAY, detail)
         if present and condition not in self._active:
-            if error is GatewayError.TELEMETRY_LOST and self._open:
+            if error is GatewayError.TELEMETRY_LOST and self._is_open:
                 self._delayed_since = min(self._delayed_since, now)
             self._begin(condition, now, at)
         elif not present and condition in self._active:
@@ -188,7 +188,7 @@ class Emergencies:
 
         Errors that began before and are still present are reported.
         """
-        self._open = True
+        self._is_open = True
         for condition in self._unreported:
             if condition in self._active:
                 self._report(condition)
@@ -202,7 +202,7 @@ class Emergencies:
         Pending ones are reported later if their errors are still present.
         """
         self._report_delayed()
-        self._open = False
+        self._is_open = False
         for condition, _ in self._pending:
             if condition is not None:
                 self._unreported[condition] = None
@@ -221,9 +221,9 @@ class Emergencies:
         self.history.clear()
         for condition in self._active:
             self._note(condition)
-        self._last_is_error = False
+        self._is_last_an_error = False
         self._unreported = dict(self._active)
-        self._had_error = bool(self._active)
+        self._has_had_error = bool(self._active)
         self._last_ns = -NEVER
 
     def configure(self, node_id: int) -> None:
@@ -236,12 +236,12 @@ class Emergencies:
 
         ``ended`` is an error that has ended and was not reported. It follows the present ones.
         """
-        was_open = self._open
+        was_open = self._is_open
         self.close()
         if ended is not None:
             self.set(ended, True, now)
         self._unreported = dict(self._active)
-        self._last_is_error = self._had_error
+        self._is_last_an_error = self._has_had_error
         if was_open:
             self.open(now)
         if ended is not None:
@@ -282,17 +282,17 @@ class Emergencies:
             cob_id = self.cob_id
             if not (cob_id & INVALID_BIT or self.is_quiet):
                 self._send(cob_id & 0x7FF, data)
-                self._last_is_error = condition is not None
+                self._is_last_an_error = condition is not None
                 self._last_ns = now
 
     def _begin(self, condition: PresentError, now: int, at: int | None) -> None:
         self._active[condition] = None
-        self._had_error = True
+        self._has_had_error = True
         self._note(condition)
         if self._delayed_since != NEVER:
             happened_ns = now if at is None else at
             self._delayed.append((happened_ns, condition, self._data_of(condition)))
-        elif self._open:
+        elif self._is_open:
             self._report(condition)
             self._send_pending(now)
         else:
@@ -306,11 +306,11 @@ class Emergencies:
         """Report 0000h if errors were reported or are pending, and all have ended."""
         if self._delayed_since != NEVER:
             return
-        last_is_error = self._last_is_error
+        last_is_error = self._is_last_an_error
         if self._pending:
             condition, _ = self._pending[-1]
             last_is_error = condition is not None
-        if last_is_error and self._open and not self._active:
+        if last_is_error and self._is_open and not self._active:
             self._report(None)
             self._send_pending(now)
 

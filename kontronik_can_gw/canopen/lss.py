@@ -176,7 +176,7 @@ class LssSlave:
     def __init__(self, host: Identity, send: Callable[[bytes], None]) -> None:
         self._host = host
         self._send = send
-        self._configuring = False
+        self._is_configuring = False
         self._expected = 0
         """Command specifier that continues the present selection or identification, else 0."""
         self._scanned: int | None = None
@@ -187,7 +187,7 @@ class LssSlave:
     @property
     def configuring(self) -> bool:
         """True in the LSS configuration state, False in the waiting state."""
-        return self._configuring
+        return self._is_configuring
 
     def reset(self) -> None:
         """Return to the waiting state at an NMT reset.
@@ -216,7 +216,7 @@ class LssSlave:
         elif service == Service.IDENTIFY_NON_CONFIGURED:
             if self._is_unconfigured:
                 self._answer(Service.NON_CONFIGURED)
-        elif self._configuring:
+        elif self._is_configuring:
             self._configure(service, data)
         elif service in _SELECT:
             own = self._host.identity[service - _SELECT[0]]
@@ -241,7 +241,7 @@ class LssSlave:
         return host.active_node_id == UNCONFIGURED and host.pending_node_id == UNCONFIGURED
 
     def _enter(self, configuring: bool) -> None:
-        self._configuring = configuring
+        self._is_configuring = configuring
         self._expected = 0
         self._scanned = None
         if not configuring:
@@ -251,7 +251,7 @@ class LssSlave:
         if mode == 1:
             self._enter(configuring=True)
         elif mode == 0:
-            was_configuring = self._configuring
+            was_configuring = self._is_configuring
             self._enter(configuring=False)
             if was_configuring:
                 self._host.lss_left_configuration(now)

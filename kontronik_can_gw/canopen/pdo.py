@@ -65,7 +65,7 @@ class Tpdo:
         self._taken = taken
         self._slot = slot
         self._plan: SlotPlan | None = None
-        self._started = False
+        self._is_started = False
         self.sync = SyncTransmission(slot, status)
         self._bind_objects()
 
@@ -145,7 +145,7 @@ class Tpdo:
 
         A PDO that becomes valid in OPERATIONAL begins as if the node had just been started.
         """
-        was_running = self._running
+        was_running = self._is_running
         self.read()
         self._plan = compile_pdo(self.mapped) if self.mapped else None
         settings = None
@@ -261,18 +261,18 @@ class Tpdo:
     # --- transmission
 
     @property
-    def _running(self) -> bool:
-        return self._started and self.valid and self._plan is not None
+    def _is_running(self) -> bool:
+        return self._is_started and self.valid and self._plan is not None
 
     def start(self, now: int) -> None:
         """Start because the node is OPERATIONAL. Event-driven PDOs send their values once."""
-        self._started = True
+        self._is_started = True
         self.sync.begin()
         self._slot.start(now)
 
     def stop(self) -> None:
         """Send no PDO until ``start``, because the node has left OPERATIONAL."""
-        self._started = False
+        self._is_started = False
         self.sync.stop()
         self._slot.stop()
 
@@ -288,7 +288,7 @@ class Tpdo:
 
     def on_sync(self, counter: int, now: int, answer: bool) -> None:
         """Count a SYNC, see ``SyncTransmission.on_sync``."""
-        if self._running:
+        if self._is_running:
             self.sync.on_sync(counter, now, answer)
 
 

@@ -71,7 +71,7 @@ class SdoServer:
         self._send = send
         self._segment_ns = segment_ns
         self._transfer: Transfer | None = None
-        self._confirming = False
+        self._is_confirming = False
         """All data has arrived, and the dictionary's result is pending."""
         self._deadline = NEVER
         self._multiplexer = _NO_MULTIPLEXER
@@ -90,12 +90,12 @@ class SdoServer:
     @property
     def busy(self) -> bool:
         """True while a transfer runs or waits for its confirmation."""
-        return self._transfer is not None or self._confirming
+        return self._transfer is not None or self._is_confirming
 
     @property
     def waiting(self) -> int | None:
         """The ticket of the download that waits for ``confirm``, or None. Each has another."""
-        return self._ticket if self._confirming else None
+        return self._ticket if self._is_confirming else None
 
     def receive(self, data: bytes, now: int) -> None:
         """Serve the data of one request frame. Other lengths than 8 bytes are ignored."""
@@ -125,7 +125,7 @@ class SdoServer:
         ``ticket`` that ``waiting`` returned, so that the result of a dropped transfer does not
         confirm the next one.
         """
-        if not self._confirming:
+        if not self._is_confirming:
             return
         if ticket is not None and ticket != self._ticket:
             return
@@ -154,7 +154,7 @@ class SdoServer:
     def reset(self) -> None:
         """Drop any transfer without an answer."""
         self._transfer = None
-        self._confirming = False
+        self._is_confirming = False
         self._sub_block.close()
         self._outgoing.clear()
         self._deadline = NEVER
@@ -279,7 +279,7 @@ class SdoServer:
         """Pass all data to the dictionary. ``answer`` confirms the download."""
         # set before the call, because the dictionary may confirm or reset from within it
         self._transfer = None
-        self._confirming = True
+        self._is_confirming = True
         self._ticket += 1
         self._confirmation = answer
         ticket = self._ticket

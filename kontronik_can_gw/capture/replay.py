@@ -67,7 +67,7 @@ class Replay:
         self._waiting = TransmitQueue()
         self._taken: list[TimedFrame] = []
         """Frames of the last iteration. The next entry shows if they were sent."""
-        self._started = False
+        self._is_started = False
         self._adopt_until: int | None = None
         """While the beginning of the run is missing, STATE entries up to the first one after this
         time are adopted. Otherwise None.
@@ -120,7 +120,9 @@ class Replay:
         if call is None:
             self._follow_note(entry)
             return []
-        if not self._started and call.kind == EntryKind.ADVANCE:  # the run's beginning is missing
+        if (
+            not self._is_started and call.kind == EntryKind.ADVANCE
+        ):  # the run's beginning is missing
             self._adopt_until = entry.time_ns + SETTLE_NS
             self._make_call(CALL_OF[EntryKind.START], (entry.time_ns, True))
         if call.kind == EntryKind.PORT_LOST and not self._counts_lost_ports:
@@ -143,7 +145,7 @@ class Replay:
         """Make a recorded call. Returns its result: frames that were sent, or None."""
         result: object = getattr(self.gateway, call.method)(*arguments)
         if call.kind == EntryKind.START:
-            self._started = True
+            self._is_started = True
             if self._marked:
                 self.gateway.status.state = GatewayState.REPLAY
         return result

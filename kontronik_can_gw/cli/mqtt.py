@@ -87,7 +87,7 @@ def main(args: argparse.Namespace) -> int:
         except OSError as error:  # a file of [mqtt]
             raise UserError(str(error)) from None
         can = can_config(bus, args.interface, args.channel)
-        with Bus(bus, can, patient=Notifier().present) as source:
+        with Bus(bus, can, patient=Notifier().is_present) as source:
             publisher = Publisher(bus, topics, settings)
             log.info("publishing %s below %s/", ", ".join(publisher.escs) or "no ESC", topics.of())
             _publish(source, publisher, client)

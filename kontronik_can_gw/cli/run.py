@@ -66,7 +66,7 @@ def main(args: argparse.Namespace) -> int:
         try:
             _Run(args, notifier).main()
         except UserError as error:
-            if not notifier.present:
+            if not notifier.is_present:
                 raise
             refused = error
             for problem in error.problems:

@@ -105,7 +105,7 @@ class _Message(Traits):
         self._sent_ns = -NEVER
         self._cycle_due = first_cycle if plan.cycle_ns else NEVER
         self._deferred_until = NEVER
-        self._cycle_deferred = False
+        self._is_cycle_deferred = False
 
     @property
     def due(self) -> int:
@@ -124,7 +124,7 @@ class _Message(Traits):
     def sent(self, now: int) -> None:
         """Note that a frame of it was sent. Only further groups remain to be sent."""
         self._sent_ns = now
-        self._cycle_deferred = False
+        self._is_cycle_deferred = False
         distance = max(self.plan.delay_ns, _MIN_DISTANCE_NS)
         self._deferred_until = now + distance if self.pages_to_send else NEVER
 
@@ -139,10 +139,10 @@ class _Message(Traits):
         if self._deferred_until <= now:
             when = self._deferred_until
             why = _REQUEST
-            if self._cycle_deferred:
+            if self._is_cycle_deferred:
                 why |= _CYCLE
             self._deferred_until = NEVER
-            self._cycle_deferred = False
+            self._is_cycle_deferred = False
         start = self._cycle_due
         if start <= now:
             cycle = self.plan.cycle_ns
@@ -150,7 +150,7 @@ class _Message(Traits):
             if self.may_go(now):
                 return min(when, start), why | _CYCLE
             self.defer()
-            self._cycle_deferred = True
+            self._is_cycle_deferred = True
         return when, why
 
     def schedule_place(self) -> SchedulePosition:
@@ -161,7 +161,7 @@ class _Message(Traits):
             self.place,
             max(-1, self._sent_ns),
             deferred_until,
-            int(self._cycle_deferred),
+            int(self._is_cycle_deferred),
         )
 
     def adopt(self, place: SchedulePosition) -> None:
@@ -171,7 +171,7 @@ class _Message(Traits):
         if place.sent_ns >= 0:
             self._sent_ns = place.sent_ns
         self._deferred_until = NEVER if place.deferred_until < 0 else place.deferred_until
-        self._cycle_deferred = bool(place.cycle_deferred)
+        self._is_cycle_deferred = bool(place.cycle_deferred)
 
     def follows(self, events: int, up: bool) -> bool:
         """Return True if the message is sent for these events of an ESC.
@@ -250,8 +250,8 @@ class Messages:
                 self._timed.append(message)
         self.pending: dict[int, int] = {}
         """Indices of the messages that ``take`` sends, and the times at which they became due."""
-        self._stopping = False
-        self._quiet = False
+        self._is_stopping = False
+        self._is_quiet = False
 
     @property
     def next_due(self) -> int:
@@ -273,7 +273,7 @@ class Messages:
 
     def on_event(self, esc: int, events: int, now: int) -> None:
         """Mark the messages that follow these events of an ESC (bits of telemetry.Event)."""
-        if self._quiet:
+        if self._is_quiet:
             return
         state = self._escs[esc]
         up = state.live is not None
@@ -290,7 +290,7 @@ class Messages:
 
         With ``each_second`` only its counters changed, which matters for messages without a cycle.
         """
-        if self._quiet:
+        if self._is_quiet:
             return
         for message in self._of_gateway:
             if not (each_second and message.plan.cycle_ns):
@@ -301,7 +301,7 @@ class Messages:
 
         Receivers must not keep values from before a restart or an outage.
         """
-        if self._quiet:
+        if self._is_quiet:
             return
         for message in self._messages:
             message.last.clear()
@@ -311,8 +311,8 @@ class Messages:
 
     def stop(self, now: int) -> None:
         """Send the messages with the gateway's own state at once, all groups, at any distance."""
-        if not self._quiet:
-            self._stopping = True
+        if not self._is_quiet:
+            self._is_stopping = True
             self._send_last(now)
 
     def begin_quiet(self, now: int) -> None:
@@ -323,11 +323,11 @@ class Messages:
         for message in self._messages:
             message.pages_to_send.clear()
         self._send_last(now)
-        self._quiet = True
+        self._is_quiet = True
 
     def end_quiet(self, now: int) -> None:
         """Send everything again."""
-        self._quiet = False
+        self._is_quiet = False
         self.on_gateway_change(now)
         self.repeat(now)
 
@@ -371,7 +371,7 @@ class Messages:
             message.why = 0
             if self._prepare(message, why, now):
                 frames.append(self._frame(message, now))
-                while (self._stopping or self._quiet) and message.pages_to_send:
+                while (self._is_stopping or self._is_quiet) and message.pages_to_send:
                     frames.append(self._frame(message, now))
         return frames
 

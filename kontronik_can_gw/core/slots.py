@@ -50,7 +50,7 @@ class SlotPlan:
     """The part of it that a core in C cannot express, or an empty string."""
     seed: int | None = None
     """The initial value of the CRC of a transfer of up to 16 bytes, or None for a frame."""
-    paced: bool = False
+    is_paced: bool = False
 
 
 class SlotSettings(NamedTuple):
@@ -135,7 +135,7 @@ class PythonSlot:
         self._esc = esc
         self._escs = (owner.escs[esc],)
         self._settings: SlotSettings | None = None
-        self._started = False
+        self._is_started = False
         self._last_ns = -NEVER
         self._last_watched = -1
         self._timer_due = self._deferred_until = NEVER
@@ -149,7 +149,7 @@ class PythonSlot:
         self._settings = settings
         if settings is not None:
             self.can_id = settings.can_id
-        if not self._started:
+        if not self._is_started:
             return
         if settings is None:
             self._rest()
@@ -164,7 +164,7 @@ class PythonSlot:
 
     def start(self, now: int) -> None:
         self._rest()
-        self._started = True
+        self._is_started = True
         self._last_ns = -NEVER
         self._last_watched = -1
         if (settings := self._settings) is not None:
@@ -174,12 +174,12 @@ class PythonSlot:
         self._set_due()
 
     def stop(self) -> None:
-        self._started = False
+        self._is_started = False
         self._rest()
 
     def news(self, now: int) -> None:
         settings = self._settings
-        if not self._started or settings is None:
+        if not self._is_started or settings is None:
             return
         self.is_news = True
         owner = self._owner
@@ -189,13 +189,13 @@ class PythonSlot:
         if now >= until:
             self._deferred_until = NEVER
             owner.mark_pending(self, now)
-        elif self._deferred_until == NEVER and not settings.plan.paced:
+        elif self._deferred_until == NEVER and not settings.plan.is_paced:
             # A paced slot waits for the next event or its timer instead.
             self._deferred_until = until
         self._set_due()
 
     def send(self, now: int) -> None:
-        if self._started and self._settings is not None and not self._owner.is_quiet:
+        if self._is_started and self._settings is not None and not self._owner.is_quiet:
             self._owner.mark_pending(self, now)
 
     def on_event(self, now: int) -> None:
@@ -227,7 +227,7 @@ class PythonSlot:
         escs = self._escs
         assert settings is not None
         plan = settings.plan
-        if plan.paced and not self._is_known(plan):
+        if plan.is_paced and not self._is_known(plan):
             self._last_ns = -NEVER
             self._timer_due = NEVER
             self._set_due()
@@ -235,7 +235,7 @@ class PythonSlot:
         if plan.needs_live and escs[0].live is None:
             return []
         self.is_news = False
-        self._last_ns = self._moment(settings, now) if plan.paced else now
+        self._last_ns = self._moment(settings, now) if plan.is_paced else now
         self._deferred_until = NEVER
         self._restart_timer(settings, self._last_ns)
         self._set_due()

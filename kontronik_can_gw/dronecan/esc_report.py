@@ -175,7 +175,7 @@ def _slot_plan(
         pack_watched=None,
         needs_live=False,
         seed=kind.seed,
-        paced=True,
+        is_paced=True,
     )
 
 
@@ -283,7 +283,7 @@ class EscReport:
         """The bits whose begin was logged, and whose end was not."""
         self._onsets = 0
         """Number of errors since the motor was started."""
-        self._turns = False
+        self._is_turning = False
         self._quiet_until: dict[int, int] = {}
         """Time until which a bit is not logged again."""
 
@@ -356,9 +356,9 @@ class EscReport:
         word = self.word
         if self.esc.up:
             turns = bool(steps_of(self._speed, self.esc, self.esc.live))
-            if turns and not self._turns:
+            if turns and not self._is_turning:
                 self._onsets = 0  # the motor was started
-            self._turns = turns
+            self._is_turning = turns
         if not events & Event.LINK:
             self._onsets += (word & ~self._before & self._errors).bit_count()
         self._before = word

@@ -29,7 +29,7 @@ class Conflict:
     """The time of the last frame."""
     count: int = 0
     """Number of frames of the other device."""
-    over: bool = False
+    is_over: bool = False
     """True if the conflict has ended."""
 
     @property
@@ -118,7 +118,7 @@ class IdConflicts:
             return
         ended = [each for each in self._present.values() if now - each.last > _OVER_NS]
         for conflict in ended:
-            conflict.over = True
+            conflict.is_over = True
             del self._present[conflict.key]
             self._news.append(conflict)
             node = (conflict.output, conflict.node)

@@ -110,7 +110,7 @@ def write_message(message: Any, settings: SlotSettings, signals: int) -> None:
     message.length = plan.message.length
     message.words = 2 if plan.message.length > 8 else 1
     flags = KCG.EVENT * settings.by_event | KCG.SILENT_ON_LOSS * plan.needs_live
-    message.flags = flags | KCG.TRANSFER * is_transfer | KCG.PACED * plan.paced
+    message.flags = flags | KCG.TRANSFER * is_transfer | KCG.PACED * plan.is_paced
     message.triggers = plan.triggers
     message.signals = signals
     message.cycle = settings.timer_ns
@@ -153,7 +153,7 @@ class NativeSlot:
         self._place = place
         self._esc = esc
         self._python = python
-        self._started = False
+        self._is_started = False
         self.is_in_c = False
 
     @property
@@ -179,19 +179,19 @@ class NativeSlot:
         self._python.configure(None if self.is_in_c else settings, now)
         if was_in_c and not self.is_in_c:
             self._call("stop")
-        elif self.is_in_c and self._started:
+        elif self.is_in_c and self._is_started:
             self._call("changed" if was_in_c else "start", now)
         self._host.choose_events()
 
     def start(self, now: int) -> None:
-        self._started = True
+        self._is_started = True
         self._python.start(now)
         if self.is_in_c:
             self._call("start", now)
         self._host.choose_events()
 
     def stop(self) -> None:
-        self._started = False
+        self._is_started = False
         self._python.stop()
         if self.is_in_c:
             self._call("stop")

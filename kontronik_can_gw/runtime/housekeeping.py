@@ -201,7 +201,7 @@ class Housekeeping:
         """Log the begin and the end of conflicts with other devices that send with our ids."""
         for conflict in self._gateway.conflicts.take():
             condition = f"CAN {self._can.config.channel}: {conflict.ids}"
-            if conflict.over:
+            if conflict.is_over:
                 text = f"{condition}: no other device uses it now"
                 self._conditions.end(condition, text, now, f"; {counted(conflict.count, 'frame')}")
                 continue
@@ -231,7 +231,7 @@ class Housekeeping:
 
         A port that the loop does not serve in time is a reason to restart the process.
         """
-        if now >= self._notify_due and self._notifier.present:
+        if now >= self._notify_due and self._notifier.is_present:
             self._notify_due = now + STATUS_NS
             self._notifier.status(self.status_words())
         if self._alive_due is None or now < self._alive_due:

@@ -65,7 +65,7 @@ class Loop:
         self._statistics = statistics
         self._recorder = recorder
         self._revision = 0
-        self._stopping = False
+        self._is_stopping = False
         self._reason = "stopped"
         self._is_ready = False
         self._poller = poller or Poller(clock)
@@ -100,7 +100,7 @@ class Loop:
     def stop(self, reason: str = "stopped") -> None:
         """End ``run`` soon, and log ``reason``. A signal handler or another thread may call it."""
         self._reason = reason
-        self._stopping = True
+        self._is_stopping = True
         self._wake.wake()
 
     def open(self) -> None:
@@ -133,7 +133,7 @@ class Loop:
         """Run until ``stop`` is called. Then send a final status and close everything."""
         self.begin()
         try:
-            while not self._stopping:
+            while not self._is_stopping:
                 self.turn()
         except UserError as error:
             self._reason = f"ended ({error})"

@@ -36,11 +36,11 @@ def test_an_id_conflict_is_reported_once_and_cleared_when_it_ends() -> None:
     assert [frame.data[:4] for frame in bench.take()] == [b"\x50\x81\x11\xff"]
     assert bench.gateway.status.id_conflicts == 300
     begun = bench.gateway.conflicts.take()
-    assert [(c.key, c.over) for c in begun] == [(0x701, False), (0x081, False), (0x581, False)]
+    assert [(c.key, c.is_over) for c in begun] == [(0x701, False), (0x081, False), (0x581, False)]
     assert begun[0].whose == "the heartbeat of CANopen node 1"
     bench.wait(12_000)
     assert [frame.data for frame in bench.take()] == [bytes((0, 0, 0, 0xFF, 0, 0, 0, 0))]
-    assert [(c.key, c.count, c.over) for c in bench.gateway.conflicts.take()] == [
+    assert [(c.key, c.count, c.is_over) for c in bench.gateway.conflicts.take()] == [
         (can_id, 100, True) for can_id in (0x701, 0x081, 0x581)
     ]
 

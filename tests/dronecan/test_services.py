@@ -146,5 +146,5 @@ def test_another_device_with_our_node_id_is_reported_and_sending_continues() -> 
         bench.receive(*frames)
     assert not taken()
     bench.run(11)
-    assert [each.over for each in taken()] == [True]
+    assert [each.is_over for each in taken()] == [True]
     assert {node["state"] for node in bench.nodes} == {"operational"}

@@ -168,7 +168,7 @@ class Drive:
             found.append(f"rejected {esc + 1} {key >> 8:04X}:{key & 255:02X}")
         for conflict in gateway.conflicts.take():
             can_id = conflict.key & 0x1FFFFFFF
-            end = " is over" if conflict.over else ""
+            end = " is over" if conflict.is_over else ""
             found.append(f"conflict {can_id:03X} {conflict.whose}{end}")
         gateway.take_link_changes()
         return found

@@ -91,7 +91,7 @@ def test_an_unusable_socket_does_no_harm(address: str) -> None:
         notifier.watchdog()
         notifier.stopping()
     notifier.close()
-    assert notifier.present == (address[:1] in ("/", "@"))
+    assert notifier.is_present == (address[:1] in ("/", "@"))
     assert Notifier({"WATCHDOG_USEC": "1000"}).watchdog_ns is None
 
 

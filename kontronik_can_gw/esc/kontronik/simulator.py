@@ -336,7 +336,7 @@ class SimulatedEsc:
         self._start_ns = start_ns
         self._tick_ns = start_ns
         self._frame_number = 0
-        self._info_due = False
+        self._is_info_due = False
         self._model = self._power_up(options.device, seed)
         self._swaps = list(reversed(faults.swaps))
         self._faults = faults
@@ -356,9 +356,9 @@ class SimulatedEsc:
         now_ns = self.next_ns
         since_start = now_ns - self._start_ns
         data: Data
-        if self._info_due:
+        if self._is_info_due:
             data = self._model.info(self._error_word(SelfTestError, since_start))
-            self._info_due = False
+            self._is_info_due = False
             self.next_ns = self._tick_ns
         else:
             while self._swaps and since_start >= self._swaps[-1].time_ns:
@@ -369,7 +369,7 @@ class SimulatedEsc:
             self.next_ns = self._tick_ns
             self._frame_number += 1
             if options.info_every and self._frame_number % options.info_every == 0:
-                self._info_due = True
+                self._is_info_due = True
                 length = 40 if self.layout is WireLayout.V4 else 38
                 self.next_ns = now_ns + min(length * BYTE_NS, options.period_ns // 2)
         if self._faults.dropout is not None:

@@ -66,7 +66,7 @@ class CanLink:
         self._own_ids = IdLocks(config, gateway, conditions)
         self._receive_ids: frozenset[int] | None = None
         """The ids that the open port receives."""
-        self._drained = True
+        self._is_drained = True
         self._noted = PortInput()
         self._stuck = StuckCheck(self._noted)
         fd = self.controller.fileno()
@@ -262,9 +262,9 @@ class CanLink:
             self.gate.made_room()
             self._watch(select.POLLIN)
         if events & select.POLLIN:
-            since = self._poller.times.before if self._drained else 0
+            since = self._poller.times.before if self._is_drained else 0
             frames = self.port.receive()
-            self._drained = self.port.drained
+            self._is_drained = self.port.drained
             self._gateway.status.received_frames += len(frames)
             for frame, received_ns in frames:
                 if received_ns is None:

@@ -48,7 +48,7 @@ class Notifier:
         self._status = ""
 
     @property
-    def present(self) -> bool:
+    def is_present(self) -> bool:
         """True if there is a service manager."""
         return bool(self._address)
 
