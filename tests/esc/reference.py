@@ -56,7 +56,7 @@ def form_row(kind: str, layout: str) -> FormRow:
 
 def seal(row: FormRow, middle: bytes) -> bytes:
     """Return a valid frame with these bytes between header and CRC."""
-    assert len(middle) == row.crc_at - 4
+    assert len(middle) == row.crc_at - 4, "the fields and FORM_ROWS of tests/specification differ"
     frame = row.header + middle
     return frame + crc32(frame[: row.covered]).to_bytes(4, "little")
 

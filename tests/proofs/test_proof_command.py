@@ -195,4 +195,5 @@ def test_without_a_dbc_output_there_is_nothing_to_prove(tmp_path: Path, prove: P
 
 
 def test_each_value_is_in_the_sheet_of_the_proof() -> None:
-    assert QUANTITIES.keys() == VALUES.keys()
+    missing = VALUES.keys() ^ QUANTITIES.keys()
+    assert not missing, "add them to tests/specification/quantities.py, or to esc/values.py"

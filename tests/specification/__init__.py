@@ -62,8 +62,8 @@ INFO_FIELDS = [
     Field("max_bec_temperature", 36, "b", "°C"),
 ]
 
-LIVE_STRUCT = "<IHhhhHHHHbBbbIBB"
-INFO_STRUCT = "<HHIBIHHhhhHHbBbbbb"
+LIVE_STRUCT = "<" + "".join(field.code for field in LIVE_FIELDS)
+INFO_STRUCT = "<" + "".join(field.code for field in INFO_FIELDS)
 
 TYPE_RANGES = {
     "B": (0, 255),

@@ -295,7 +295,8 @@ def _frame_problems(expected: ExpectedMessage, plan: PlannedMessage) -> Iterator
     if plan.crc is not None and expected.crc is not None:
         for name, number, wanted in zip(CrcRule._fields, plan.crc, expected.crc, strict=True):
             if number != wanted:
-                yield f"its CRC has {name.replace('_', ' ')} {number}, not {wanted}"
+                words = name.replace("_", " ").replace("ids", "IDs")
+                yield f"its CRC has {words} {number}, not {wanted}"
     known = {(signal.name, signal.page) for signal in expected.signals}
     for signal in plan.signals:
         if (signal.name, signal.page) not in known:
