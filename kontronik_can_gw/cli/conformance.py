@@ -77,8 +77,7 @@ by a signal
 
 def main(args: argparse.Namespace) -> int:
     if args.list:
-        for item in all_items():
-            print(f"{item.name:45}  {item.clause}: {item.stimulus}")
+        _print_items()
         return 0
     if not 1 <= args.node <= 127:
         raise UserError(f"--node {args.node}: a node-ID is a number from 1 to 127")
@@ -93,7 +92,12 @@ def main(args: argparse.Namespace) -> int:
         results = _results(slave, items, deviations)
     _write_reports(args, path, results)
     say(counts(results), args.command)
-    return 1 if any(result.verdict is ItemVerdict.FAILED for result in results) else 0
+    return int(any(result.verdict is ItemVerdict.FAILED for result in results))
+
+
+def _print_items() -> None:
+    for item in all_items():
+        print(f"{item.name:45}  {item.clause}: {item.stimulus}")
 
 
 def _write_reports(args: argparse.Namespace, eds: Path, results: list[Result]) -> None:
