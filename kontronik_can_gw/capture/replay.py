@@ -120,9 +120,8 @@ class Replay:
         if call is None:
             self._follow_note(entry)
             return []
-        if (
-            not self._is_started and call.kind == EntryKind.ADVANCE
-        ):  # the run's beginning is missing
+        if not self._is_started and call.kind == EntryKind.ADVANCE:
+            # The beginning of the run is missing.
             self._adopt_until = entry.time_ns + SETTLE_NS
             self._make_call(CALL_OF[EntryKind.START], (entry.time_ns, True))
         if call.kind == EntryKind.PORT_LOST and not self._counts_lost_ports:

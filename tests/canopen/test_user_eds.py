@@ -150,7 +150,7 @@ def test_a_configured_setting_that_does_not_fit_its_object_is_refused() -> None:
         text = with_key(text, "2100sub4", key, value)
     assert problems(text, 1) == ()
     eds = reader.load(text.encode(), "my.eds")
-    said = "2100h:04 Telemetry timeout: cannot hold 5000, the configured value of b"
+    said = "2100h:04 Telemetry time.out: cannot hold 5000, the configured value of b"
     with pytest.raises(UserError, match=said):
         check_eds(eds, shipped_eds(), [EscSettings(), EscSettings("b", timeout_ns=5_000_000_000)])
 
