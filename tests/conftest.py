@@ -51,7 +51,7 @@ def pytest_collection_finish() -> None:
 
 TESTS = Path(__file__).parent
 ON_BOTH_CORES = (
-    "gateway/test_an_output_of_its_own.py",
+    "gateway/test_output_of_its_own.py",
     "gateway/test_quiet_mode.py",
     "gateway/test_values_on_the_bus.py",
     "golden/test_golden.py::test_frames_have_not_changed",
@@ -61,7 +61,7 @@ ON_BOTH_CORES = (
     "canopen/test_outages_and_order.py",
     "canopen/test_dialogues.py",
     "canopen/test_sync_at_once.py",
-    "dronecan/test_in_a_gateway.py::test_a_bus_that_is_too_slow_gets_complete_transfers",
+    "dronecan/test_in_a_gateway.py::test_bus_that_is_too_slow_gets_complete_transfers",
     "runtime/test_hold_ups.py",
     "runtime/test_esc_input.py",
     "runtime/test_quiet_mode_in_the_loop.py",

@@ -174,7 +174,7 @@ def test_only_the_edge_blocks_and_no_module_compiles_text(path: Path) -> None:
         assert "open" not in _calls(path)
 
 
-def test_the_protocol_imports_only_the_standard_library() -> None:
+def test_protocol_imports_only_the_standard_library() -> None:
     for path in (PACKAGE / "esc" / "kontronik").glob("*.py"):
         for module in _imports(path):
             top = module.split(".")[0]
@@ -197,7 +197,7 @@ def test_no_serial_port_is_ever_written() -> None:
 
 
 @pytest.mark.promise("layout-in-files")
-def test_the_package_contains_no_can_id_of_the_shipped_dbc() -> None:
+def test_package_contains_no_can_id_of_the_shipped_dbc() -> None:
     """Ids of the shipped DBC do not appear in the modules of the package."""
     for path in MODULES:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

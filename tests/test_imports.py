@@ -137,7 +137,7 @@ def surplus(modules: set[str], allowed: set[str]) -> set[str]:
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_a_running_gateway_imports_only_the_listed_modules(name: str, tmp_path: Path) -> None:
+def test_running_gateway_imports_only_the_listed_modules(name: str, tmp_path: Path) -> None:
     tables, further, own = CONFIGURATIONS[name]
     modules = imported(tmp_path, tables)
     assert "kontronik_can_gw.runtime.loop" in modules
@@ -146,7 +146,7 @@ def test_a_running_gateway_imports_only_the_listed_modules(name: str, tmp_path: 
     assert modules & (CANOPEN | RECORDER) == own
 
 
-def test_a_module_that_is_not_listed_is_found(tmp_path: Path) -> None:
+def test_module_that_is_not_listed_is_found(tmp_path: Path) -> None:
     """The test imports a library and a module of ours that a gateway does not need."""
     modules = imported(
         tmp_path,

@@ -57,7 +57,7 @@ def step(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
         ("exit 5", [], (0, 0, 0), "passed"),  # the chosen expression matches no test
     ],
 )
-def test_a_step_is_judged_by_its_report_and_its_exit_code(
+def test_step_is_judged_by_its_report_and_its_exit_code(
     step: Any,
     command: str,
     cases: list[str],
@@ -69,7 +69,7 @@ def test_a_step_is_judged_by_its_report_and_its_exit_code(
     assert (".crc: 3 is not 4" in result.failures) == ("failed" in cases)
 
 
-def test_a_step_without_tests_is_one_check_with_a_time_limit(
+def test_step_without_tests_is_one_check_with_a_time_limit(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
@@ -84,7 +84,7 @@ def test_a_step_without_tests_is_one_check_with_a_time_limit(
         assert result.note == note
 
 
-def test_a_step_without_its_tools_is_not_run_and_the_remedy_is_named(
+def test_step_without_its_tools_is_not_run_and_the_remedy_is_named(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -99,7 +99,7 @@ def test_a_step_without_its_tools_is_not_run_and_the_remedy_is_named(
     assert "to leave it out:  --without faults" in shown
 
 
-def test_a_step_that_cannot_run_can_be_left_out_by_name(
+def test_step_that_cannot_run_can_be_left_out_by_name(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(checks.NEEDS, "lint", ("no-such-program", "sudo make one"))
@@ -117,7 +117,7 @@ def test_a_step_that_cannot_run_can_be_left_out_by_name(
     ("failed", "skipped", "code", "strict_code"),
     [(0, 0, 0, 0), (1, 0, 1, 1), (0, 2, 0, 1)],
 )
-def test_the_last_line_has_the_totals(
+def test_last_line_has_the_totals(
     capsys: pytest.CaptureFixture[str],
     failed: int,
     skipped: int,
@@ -154,7 +154,7 @@ def test_every_step_is_in_one_tier_and_every_marker_is_run() -> None:
     assert "-m 'extended or rights'" in checks.STEPS["tools"], "CI runs this one as root"
 
 
-def test_a_step_may_take_as_long_as_the_page_about_proofs_says() -> None:
+def test_step_may_take_as_long_as_the_page_about_proofs_says() -> None:
     page = (checks.PROJECT / "tests/proofs/README.md").read_text(encoding="utf-8")
     row = r"^\| `make release ARGS=\"--only (\w+)\".*\| (\d+) hours \|$"
     rows = re.findall(row, page, re.MULTILINE)

@@ -12,7 +12,7 @@ def test_telemetry_is_shown(bench: Bench, display: Display) -> None:
     assert 18 < voltage < 26
 
 
-def test_a_lost_esc_shows_dashes_and_one_that_is_back_shows_values(
+def test_lost_esc_shows_dashes_and_one_that_is_back_shows_values(
     bench: Bench, display: Display
 ) -> None:
     bench.plug_in()
@@ -24,13 +24,13 @@ def test_a_lost_esc_shows_dashes_and_one_that_is_back_shows_values(
     until(lambda: display.shown("BatteryVoltage") is not None)
 
 
-def test_an_error_of_the_esc_is_shown(bench: Bench, display: Display) -> None:
+def test_error_of_the_esc_is_shown(bench: Bench, display: Display) -> None:
     bench.plug_in("--error", "undervoltage@1s+2s")
     until(lambda: display.shown("Undervoltage") == 1)
     until(lambda: display.shown("Undervoltage") == 0)
 
 
-def test_a_bus_that_goes_down_shows_dashes_until_it_is_back(bench: Bench, display: Display) -> None:
+def test_bus_that_goes_down_shows_dashes_until_it_is_back(bench: Bench, display: Display) -> None:
     bench.plug_in()
     until(lambda: display.shown("BatteryVoltage") is not None)
     bench.bus("down")
@@ -39,7 +39,7 @@ def test_a_bus_that_goes_down_shows_dashes_until_it_is_back(bench: Bench, displa
     until(lambda: display.shown("BatteryVoltage") is not None)
 
 
-def test_a_gateway_that_is_gone_shows_dashes(bench: Bench, display: Display) -> None:
+def test_gateway_that_is_gone_shows_dashes(bench: Bench, display: Display) -> None:
     bench.plug_in()
     until(lambda: display.shown("BatteryVoltage") is not None)
     bench.gateway.kill()

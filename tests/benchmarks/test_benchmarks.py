@@ -12,7 +12,7 @@ pytestmark = pytest.mark.promise("sharp-tests")
 
 @pytest.mark.extended
 @pytest.mark.usefixtures("c_compiler")
-def test_a_short_run_of_the_three_programs_gives_a_table(
+def test_short_run_of_the_three_programs_gives_a_table(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,

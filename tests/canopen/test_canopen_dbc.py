@@ -152,7 +152,7 @@ class Bench(dialogue.Bench):
 # --- the shipped file
 
 
-def test_the_command_writes_the_shipped_file(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_the_shipped_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["dbc", "--canopen"]) == 0
     assert capsys.readouterr().out == SHIPPED.read_text()
     assert copies_text(read(SHIPPED.read_text())) == SHIPPED.read_text(), "it can be written again"
@@ -216,7 +216,7 @@ def delay(message: Any) -> int:
     return 0 if found is None else found.value
 
 
-def test_the_dbc_has_the_timing_of_pdos_at_syncs_and_disabled_messages() -> None:
+def test_dbc_has_the_timing_of_pdos_at_syncs_and_disabled_messages() -> None:
     bench = dialogue.Bench()
     remap(bench, 0, 0x181, [0x20000120], kind=3)
     remap(bench, 1, 0x281, [0x20000410], kind=0)
@@ -250,7 +250,7 @@ PLAIN = [
 ]
 
 
-def test_a_storage_object_of_any_eds_is_a_raw_signal_with_its_name() -> None:
+def test_storage_object_of_any_eds_is_a_raw_signal_with_its_name() -> None:
     text = EDS_TEXT
     for number, (name, kind, value, *_) in enumerate(PLAIN):
         content = variable(kind, name=name, DefaultValue=value, PDOMapping=1)
@@ -290,7 +290,7 @@ def test_names_that_are_too_long_are_cut_and_remain_unique() -> None:
     assert "PortOuter1LimitBatteryVoltageMin" in names
 
 
-def test_a_node_that_waits_for_lss_has_no_frames_and_causes_a_warning(
+def test_node_that_waits_for_lss_has_no_frames_and_causes_a_warning(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:

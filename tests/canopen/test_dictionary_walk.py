@@ -223,7 +223,7 @@ def test_lost_values_abort_or_remain_or_are_codes_as_configured(
     assert bench.number(0x2020, 10) == 1
 
 
-def test_the_status_registers_show_link_and_controller_state() -> None:
+def test_status_registers_show_link_and_controller_state() -> None:
     bench = fed()
     bench.can_state("ERROR_PASSIVE")
     assert bench.number(0x1002) == 0x00030382

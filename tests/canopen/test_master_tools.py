@@ -85,7 +85,7 @@ def test_dcfgens_concise_dcf_is_accepted_and_sets_the_pdos(
     assert 0x680 in {frame.can_id for frame in bench.take()}, "the event timer"
 
 
-def test_the_canopen_package_can_save_a_pdo_without_reading_it_first() -> None:
+def test_canopen_package_can_save_a_pdo_without_reading_it_first() -> None:
     bench = Bench(changes=NO_HEARTBEAT)
     node = wire_to(bench).add_node(1, str(EDS))
     pdo = node.tpdo[5]
@@ -118,7 +118,7 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.promise("lss")
-def test_a_foreign_master_finds_slaves_by_fastscan_and_sets_node_ids() -> None:
+def test_foreign_master_finds_slaves_by_fastscan_and_sets_node_ids() -> None:
     bench = Bench(node_ids=[UNCONFIGURED] * 6 + [100], changes=QUIET)
     master = master_of(bench)
     for number in range(1, 7):
@@ -135,7 +135,7 @@ def test_a_foreign_master_finds_slaves_by_fastscan_and_sets_node_ids() -> None:
 
 
 @pytest.mark.promise("lss")
-def test_a_foreign_master_configures_and_stores_a_node_id() -> None:
+def test_foreign_master_configures_and_stores_a_node_id() -> None:
     bench = Bench(node_ids=[UNCONFIGURED] * 3, changes=QUIET)
     master = master_of(bench)
     identity = bench.nodes[1].identity.identity

@@ -27,7 +27,7 @@ TAKEN = 0x06040043
 
 
 @pytest.mark.promise("conflicts")
-def test_an_id_conflict_is_reported_once_and_cleared_when_it_ends() -> None:
+def test_id_conflict_is_reported_once_and_cleared_when_it_ends() -> None:
     bench = Bench(changes=QUIET)
     bench.take()
     for n in range(300):
@@ -87,7 +87,7 @@ def test_2100h_8_sets_the_crc_errors_a_second_of_a_degraded_link(
     assert bench.number(0x2020, 1) == link_status
 
 
-def test_a_restricted_cob_id_is_refused_and_every_other_is_accepted() -> None:
+def test_restricted_cob_id_is_refused_and_every_other_is_accepted() -> None:
     bench = Bench(changes={**QUIET, **SPARE})
     ends = (0, 0x80), (0x101, 0x181), (0x581, 0x600), (0x601, 0x680), (0x6E0, 0x700), (0x701, 0x800)
     reserved = {cob_id for pair in ends for cob_id in range(*pair)}
@@ -232,7 +232,7 @@ def test_swapped_node_ids_are_kept(tmp_path: Path) -> None:
     assert loaded.warnings == ()
 
 
-def test_a_stored_node_id_is_rejected_if_another_node_is_set_to_it(tmp_path: Path) -> None:
+def test_stored_node_id_is_rejected_if_another_node_is_set_to_it(tmp_path: Path) -> None:
     moved = {0x180001: u32(0x40000300)}
     keep(tmp_path, esc1=Stored(2), esc2=Stored(None, moved))
     loaded, nodes = loaded_nodes(tmp_path)

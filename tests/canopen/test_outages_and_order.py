@@ -37,7 +37,7 @@ def test_answers_of_a_node_are_never_overtaken() -> None:
 
 
 @pytest.mark.promise("parameters")
-def test_a_stored_value_that_does_not_fit_is_reported_once_at_each_reset() -> None:
+def test_stored_value_that_does_not_fit_is_reported_once_at_each_reset() -> None:
     stored = Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})
     bench = Bench(changes=QUIET, stored=[stored])
     assert sorted(bench.gateway.take_rejected_parameters()) == [(0, 0x101700), (0, 0x210001)]
@@ -48,7 +48,7 @@ def test_a_stored_value_that_does_not_fit_is_reported_once_at_each_reset() -> No
     assert sorted(bench.gateway.take_rejected_parameters()) == [(0, 0x101700), (0, 0x210001)]
 
 
-def test_the_node_ids_to_lock_are_known_before_the_start() -> None:
+def test_node_ids_to_lock_are_known_before_the_start() -> None:
     """Locks between gateways are taken before the first frame is sent."""
     setup = Bench(node_ids=[5, 9, UNCONFIGURED]).setup
     gateway = Gateway(
@@ -60,7 +60,7 @@ def test_the_node_ids_to_lock_are_known_before_the_start() -> None:
 
 
 @pytest.mark.promise("overload")
-def test_the_bus_load_is_computed_from_the_rate_of_each_pdo() -> None:
+def test_bus_load_is_computed_from_the_rate_of_each_pdo() -> None:
     def rate(*mapped: int, kind: int = 255, timer: int = 0) -> float:
         bench = Bench(changes={**QUIET, **tpdo(1, kind, 0, timer, *mapped)}).start()
         return traffic(bench.nodes, is_worst=False)[0]

@@ -243,7 +243,7 @@ def test_blocks_transfer_any_data_both_ways_even_if_segments_are_lost(
 
 
 @pytest.mark.parametrize("in_blocks", [True, False])
-def test_a_download_of_more_than_64_kib_is_refused(in_blocks: bool) -> None:
+def test_download_of_more_than_64_kib_is_refused(in_blocks: bool) -> None:
     def write(client: Client, data: bytes) -> None:
         if in_blocks:
             client.block_download(data, tell_size=False, with_crc=False)
@@ -289,7 +289,7 @@ def master(bench: Bench) -> Any:
     "size",
     [1, 4, 5, 7, 8, 7 * 127, 7 * 127 + 1, 5000],
 )
-def test_the_canopen_package_can_use_every_kind_of_transfer(size: int, segment_ns: int) -> None:
+def test_canopen_package_can_use_every_kind_of_transfer(size: int, segment_ns: int) -> None:
     data = random.Random(size).randbytes(size)
     bench = Bench(segment_ns)
     sdo = master(bench)
@@ -308,7 +308,7 @@ def test_the_canopen_package_can_use_every_kind_of_transfer(size: int, segment_n
     assert not bench.server.busy
 
 
-def test_a_block_upload_that_is_restarted_often_keeps_its_pace() -> None:
+def test_block_upload_that_is_restarted_often_keeps_its_pace() -> None:
     """An impatient master does not get a larger part of the bus."""
     bench = Bench(MS)
     bench.objects.find(0x2003, 0).value = bytes(6000)

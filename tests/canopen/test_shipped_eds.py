@@ -152,7 +152,7 @@ def power_on(entry: EdsEntry, node_id: int) -> int | float | bytes | None:
 
 
 @pytest.mark.parametrize("node_id", [1, 127])
-def test_the_canopen_library_reads_every_entry_like_our_reader(shipped: Eds, node_id: int) -> None:
+def test_canopen_library_reads_every_entry_like_our_reader(shipped: Eds, node_id: int) -> None:
     dictionary = canopen.import_od(str(SHIPPED), node_id=node_id)
     theirs = {}
     for v in variables(dictionary):
@@ -166,7 +166,7 @@ def test_the_canopen_library_reads_every_entry_like_our_reader(shipped: Eds, nod
     assert {index: dictionary[index].name for index in dictionary} == shipped.object_names
 
 
-def test_the_mirrors_can_be_dropped(shipped: Eds, tmp_path: Path) -> None:
+def test_mirrors_can_be_dropped(shipped: Eds, tmp_path: Path) -> None:
     mirrors = (0x603F, 0x606C, 0x6079)
     shorter = dcf.without(DATA, mirrors)
     rest = reader.load(shorter, "short.eds")

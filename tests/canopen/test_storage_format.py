@@ -38,7 +38,7 @@ def content(**changed: Any) -> str:
     return json.dumps(whole, separators=(",", ":")) + "\n"
 
 
-def test_the_text_agrees_with_the_documentation() -> None:
+def test_text_agrees_with_the_documentation() -> None:
     body = TEXT.split(b"\n", 1)[1]
     assert encode(SAMPLE) == TEXT % zlib.crc32(body)
     assert decode(TEXT % zlib.crc32(body)) == SAMPLE

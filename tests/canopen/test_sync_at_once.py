@@ -46,7 +46,7 @@ def test_each_sync_read_at_once_counts(kind: int, syncs: int, expected: int, rep
     assert bench.number(*REPLACED) == replaced
 
 
-def test_the_count_continues_after_syncs_that_were_read_at_once() -> None:
+def test_count_continues_after_syncs_that_were_read_at_once() -> None:
     bench = synced(2, LIVE_COUNTER)
     assert len(read_at_once(bench, 3)) == 1
     assert len(read_at_once(bench, 1)) == 1
@@ -58,7 +58,7 @@ def test_type_0_sends_once_and_replaces_nothing() -> None:
     assert bench.number(*REPLACED) == 0
 
 
-def test_a_waiting_pdo_carries_the_values_of_its_own_turn() -> None:
+def test_waiting_pdo_carries_the_values_of_its_own_turn() -> None:
     bench = synced(2, VOLTAGE)
     bench.uart(live(battery_voltage=2442))
     for _ in range(4):

@@ -78,7 +78,7 @@ def rows_of(name: str) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("section", "old", "new", "message"), list(rows_of("mistakes.txt")))
-def test_a_mistake_is_reported_with_section_and_key(
+def test_mistake_is_reported_with_section_and_key(
     section: str,
     old: str,
     new: str,
@@ -109,7 +109,7 @@ OUT_OF_BOUNDS = [
 
 
 @pytest.mark.parametrize(("more", "said"), OUT_OF_BOUNDS, ids=[said for _, said in OUT_OF_BOUNDS])
-def test_an_oversized_eds_is_refused_with_short_messages(more: str, said: str) -> None:
+def test_oversized_eds_is_refused_with_short_messages(more: str, said: str) -> None:
     found = problems(f"{SHIPPED}\n{more}")
     assert any(said in line for line in found), found
     assert all(len(line) < 600 for line in found)
@@ -120,7 +120,7 @@ VALUES = st.sampled_from(["", "-1", "0", "255", "0x1FFFFFFFF", "9" * 30, "[", "$
 
 @settings(max_examples=40, deadline=None)
 @given(st.data())
-def test_a_damaged_file_is_either_read_or_refused(data: st.DataObject) -> None:
+def test_damaged_file_is_either_read_or_refused(data: st.DataObject) -> None:
     lines = SHIPPED.split("\r\n")
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(lines) - 1))
@@ -144,7 +144,7 @@ def test_cob_ids_of_one_node_and_of_missing_objects_are_checked() -> None:
     assert problems(SHIPPED, *range(1, 128)) == ()
 
 
-def test_a_configured_setting_that_does_not_fit_its_object_is_refused() -> None:
+def test_configured_setting_that_does_not_fit_its_object_is_refused() -> None:
     text = SHIPPED
     for key, value in (("DataType", "0x0005"), ("HighLimit", "0xFF"), ("DefaultValue", "0xFA")):
         text = with_key(text, "2100sub4", key, value)
@@ -233,7 +233,7 @@ def test_signed_limits_and_keys_without_a_value_are_read() -> None:
         b"a\x00",
     ],
 )
-def test_a_text_that_a_dcf_cannot_contain_is_refused(value: bytes) -> None:
+def test_text_that_a_dcf_cannot_contain_is_refused(value: bytes) -> None:
     eds = reader.load(SHIPPED.encode(), "kontronik_esc.eds")
     expected = r"kontronik_esc\.eds: 2010h:06 the text .* of Device name cannot be written"
     with pytest.raises(UserError, match=expected):
@@ -325,12 +325,12 @@ def test_without_all_optional_objects_a_node_behaves_the_same() -> None:
 
 
 @pytest.mark.parametrize("number", range(6))
-def test_a_pdo_is_missing_only_without_its_own_objects(number: int) -> None:
+def test_pdo_is_missing_only_without_its_own_objects(number: int) -> None:
     left = [line for line in whole() if line.split()[1] != f"{number + 1}81"]
     assert behaviour(frozenset({0x1800 + number, 0x1A00 + number})) == left
 
 
-def test_the_session_receives_frames_of_every_service() -> None:
+def test_session_receives_frames_of_every_service() -> None:
     heard = {line.split()[1] for line in whole()}
     assert heard == {"701", "081", "181", "281", "381", "481", "7E4"}
     codes = {line.split()[2][:4] for line in whole() if line.split()[1] == "081"}
@@ -370,7 +370,7 @@ def test_files_of_windows_editors_result_in_the_same_node(data: bytes) -> None:
     assert without_names == [replace(entry, name="") for entry in plain]
 
 
-def test_a_dcf_of_a_file_with_other_letters_is_ascii() -> None:
+def test_dcf_of_a_file_with_other_letters_is_ascii() -> None:
     data = LATIN.encode("latin-1")
     text = dcf.dcf(
         reader.load(data, "mine.eds"),
@@ -386,14 +386,14 @@ def test_a_dcf_of_a_file_with_other_letters_is_ascii() -> None:
 
 
 @pytest.mark.parametrize("coding", ["latin-1", "utf-8-sig", "utf-16"])
-def test_a_mistake_in_a_file_of_a_windows_editor_is_reported_in_one_line(coding: str) -> None:
+def test_mistake_in_a_file_of_a_windows_editor_is_reported_in_one_line(coding: str) -> None:
     text = LATIN.replace("LowLimit=0x01", "LowLimit=\u00fcbel", 1).replace("\r\n", "\r")
     (found,) = problems((text + "\x1a").encode(coding))
     assert found.startswith("mine.eds: [")
     assert "LowLimit=ubel: not a number" in found
 
 
-def test_a_default_text_with_other_letters_is_refused() -> None:
+def test_default_text_with_other_letters_is_refused() -> None:
     text = with_object(variable(9, DefaultValue="Gr\u00fc\u00dfe"))
     (found,) = problems(text.encode("latin-1"))
     assert found == (
@@ -401,7 +401,7 @@ def test_a_default_text_with_other_letters_is_refused() -> None:
     )
 
 
-def test_a_key_with_other_letters_is_unknown() -> None:
+def test_key_with_other_letters_is_unknown() -> None:
     text = with_object(variable(5).replace("AccessType", "\u00c4ccessType"))
     (found,) = problems(text.encode("latin-1"))
     assert "[2200] AccessType=" in found

@@ -124,7 +124,7 @@ def test_any_flipped_bit_loses_only_its_own_block() -> None:
         assert [d.length for d in found if isinstance(d, Damage)] == [len(parts[hit])]
 
 
-def test_a_block_with_a_huge_claimed_length_is_refused() -> None:
+def test_block_with_a_huge_claimed_length_is_refused() -> None:
     """A compressed bomb, or a length from garbage, must not cost the reader time or memory."""
     packed = zlib.compress(bytes(1 << 22), 9)
     head = struct.pack(
@@ -155,7 +155,7 @@ def test_a_block_with_a_huge_claimed_length_is_refused() -> None:
         queued=st.just(False),
     )
 )
-def test_a_can_frame_is_read_as_it_was_written(frame: CanFrame) -> None:
+def test_can_frame_is_read_as_it_was_written(frame: CanFrame) -> None:
     assert read_frame(frame_data(frame)) == frame
 
 
@@ -279,7 +279,7 @@ PYTHON = re.compile(
 """Words in Python's own error messages."""
 
 
-def test_a_refused_header_is_described_in_words_for_users(header: dict[str, Any]) -> None:
+def test_refused_header_is_described_in_words_for_users(header: dict[str, Any]) -> None:
     combinations = list(itertools.product(places(header), (*VALUES, GONE)))
     random.Random(7).shuffle(combinations)
     refused = []
@@ -308,7 +308,7 @@ def test_a_refused_header_is_described_in_words_for_users(header: dict[str, Any]
         (("ports",), 7, '"ports" is not a list. Use another part of the run'),
     ],
 )
-def test_a_refused_header_names_its_part(
+def test_refused_header_names_its_part(
     header: dict[str, Any],
     place: tuple[Any, ...],
     value: Any,
@@ -322,7 +322,7 @@ def test_a_refused_header_names_its_part(
     assert refused.value.problems[0].startswith(f"{path}: the header cannot be used: {said}")
 
 
-def test_a_block_without_json_is_described_in_words_for_users(
+def test_block_without_json_is_described_in_words_for_users(
     header: dict[str, Any],
     bench: Bench,
     tmp_path: Path,
@@ -340,7 +340,7 @@ def test_a_block_without_json_is_described_in_words_for_users(
 
 
 @pytest.mark.parametrize("part", ["x", [], None])
-def test_a_later_part_without_a_number_is_damage(
+def test_later_part_without_a_number_is_damage(
     header: dict[str, Any],
     bench: Bench,
     tmp_path: Path,
@@ -421,7 +421,7 @@ def test_damage_of_a_completely_damaged_file_is_summed_up(
         assert "and further damage" in found.damage
 
 
-def test_a_header_cannot_forge_lines(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
+def test_header_cannot_forge_lines(header: dict[str, Any], bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "a.kcap"
     entries = block(b"D", 1, data_payload(bench.entries))
     for channel, shown in (("t1", "t1"), ("can0 123#11\\n(1.0) can0", "can0")):

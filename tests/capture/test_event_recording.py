@@ -88,7 +88,7 @@ def replayed(path: Path) -> tuple[list[TimedFrame], CaptureInput]:
 
 
 @BOTH
-def test_a_flight_with_two_faults_gives_two_captures_equal_to_the_flight(tmp_path: Path) -> None:
+def test_flight_with_two_faults_gives_two_captures_equal_to_the_flight(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=5, after_s=4)
     flight.fly(40)
     assert list(tmp_path.iterdir()) == []
@@ -133,7 +133,7 @@ def test_events_in_one_capture_extend_it(tmp_path: Path) -> None:
     assert "e0: two (" in found.provenance["recorded because of"]
 
 
-def test_an_event_soon_after_a_capture_has_its_seconds_before_it_too(tmp_path: Path) -> None:
+def test_event_soon_after_a_capture_has_its_seconds_before_it_too(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=5, after_s=1)
     flight.fly(30)
     flight.event("one")
@@ -148,7 +148,7 @@ def test_an_event_soon_after_a_capture_has_its_seconds_before_it_too(tmp_path: P
     assert between(frames, begin, end) == flight.sent(begin, end)
 
 
-def test_an_event_at_the_start_records_the_run_from_its_beginning(tmp_path: Path) -> None:
+def test_event_at_the_start_records_the_run_from_its_beginning(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=30, after_s=1)
     flight.fly(2)
     flight.event("undervoltage")
@@ -158,7 +158,7 @@ def test_an_event_at_the_start_records_the_run_from_its_beginning(tmp_path: Path
     assert frames[:2000] == flight.bench.sent[:2000]
 
 
-def test_a_capture_on_an_event_has_parts(tmp_path: Path) -> None:
+def test_capture_on_an_event_has_parts(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=5, after_s=150, part_minutes=1)
     flight.fly(20)
     event = flight.event("undervoltage")
@@ -173,7 +173,7 @@ def test_a_capture_on_an_event_has_parts(tmp_path: Path) -> None:
     assert "undervoltage" in found.provenance["recorded because of"]
 
 
-def test_the_part_with_the_event_is_not_removed_while_its_capture_goes_on(tmp_path: Path) -> None:
+def test_part_with_the_event_is_not_removed_while_its_capture_goes_on(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=1, after_s=300, part_minutes=1, keep_mb=1)
     flight.fly(20)
     event = flight.event("undervoltage")
@@ -210,7 +210,7 @@ def test_of_very_many_events_at_once_the_first_are_listed_and_all_are_counted(
     assert "e0: event 0 (" in found.provenance["recorded because of"]
 
 
-def test_the_last_of_very_many_events_at_once_extends_a_capture(tmp_path: Path) -> None:
+def test_last_of_very_many_events_at_once_extends_a_capture(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=1, after_s=3)
     flight.fly(16)
     for number in range(1000):
@@ -223,7 +223,7 @@ def test_the_last_of_very_many_events_at_once_extends_a_capture(tmp_path: Path) 
     assert frames[-1].time_ns >= last + 3 * SECOND - SECOND // 10
 
 
-def test_the_end_of_the_gateway_ends_a_capture(tmp_path: Path) -> None:
+def test_end_of_the_gateway_ends_a_capture(tmp_path: Path) -> None:
     flight = Flight(tmp_path, before_s=5, after_s=600)
     flight.fly(10)
     flight.event("undervoltage")
@@ -232,7 +232,7 @@ def test_the_end_of_the_gateway_ends_a_capture(tmp_path: Path) -> None:
     assert frames[-1].time_ns > flight.now - SECOND
 
 
-def test_an_event_while_the_folder_is_unusable_is_recorded_later(tmp_path: Path) -> None:
+def test_event_while_the_folder_is_unusable_is_recorded_later(tmp_path: Path) -> None:
     folder = tmp_path / "captures"
     folder.write_text("not a folder")
     flight = Flight(folder, before_s=5, after_s=3)
@@ -254,7 +254,7 @@ def test_an_event_while_the_folder_is_unusable_is_recorded_later(tmp_path: Path)
     assert between(frames, begin, end) == flight.sent(begin, end)
 
 
-def test_an_event_is_recorded_after_any_time_without_the_disk(tmp_path: Path) -> None:
+def test_event_is_recorded_after_any_time_without_the_disk(tmp_path: Path) -> None:
     folder = tmp_path / "captures"
     folder.write_text("not a folder")
     flight = Flight(folder, before_s=1, after_s=1)
@@ -307,7 +307,7 @@ def test_entries_and_an_event_that_waited_for_the_thread_are_recorded(
     assert between(frames, begin, end) == flight.sent(begin, end)
 
 
-def test_a_capture_without_any_entry_is_reported(
+def test_capture_without_any_entry_is_reported(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -330,7 +330,7 @@ def test_a_capture_without_any_entry_is_reported(
 
 
 @pytest.mark.parametrize("failing", ["append", "sync"])
-def test_a_disk_that_fails_during_a_capture_begins_a_new_one(
+def test_disk_that_fails_during_a_capture_begins_a_new_one(
     failing: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -375,7 +375,7 @@ def test_lost_entries_are_counted_while_the_disk_fails_for_long(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("ends_before", [False, True])
-def test_a_capture_states_exactly_what_a_full_disk_has_cost(
+def test_capture_states_exactly_what_a_full_disk_has_cost(
     ends_before: bool,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -426,7 +426,7 @@ def test_a_capture_states_exactly_what_a_full_disk_has_cost(
     assert (kept[-1] == remarks[0]) == ends_before
 
 
-def test_a_line_for_the_log_names_the_file(tmp_path: Path) -> None:
+def test_line_for_the_log_names_the_file(tmp_path: Path) -> None:
     flight = Flight(tmp_path)
     flight.fly(1)
     flight.it.mark()
@@ -452,7 +452,7 @@ def items(begin_s: int, count: int, size: int = 20) -> list[Entry]:
     return found
 
 
-def test_the_ring_keeps_the_configured_time_in_whole_segments() -> None:
+def test_ring_keeps_the_configured_time_in_whole_segments() -> None:
     ring = Ring(10 * SECOND, 1 << 30)
     for second in range(0, 60, 2):
         assert ring.add(items(second, 100), 0, ClockFacts()) in (0, 101)
@@ -462,7 +462,7 @@ def test_the_ring_keeps_the_configured_time_in_whole_segments() -> None:
         assert chunks[0].segment.state == b"{}"
 
 
-def test_the_ring_never_exceeds_its_size() -> None:
+def test_ring_never_exceeds_its_size() -> None:
     ring = Ring(1000 * SECOND, 20_000)
     for second in range(50):
         ring.add(items(second, 100), 0, ClockFacts())
@@ -476,7 +476,7 @@ def test_the_ring_never_exceeds_its_size() -> None:
     assert ring.bytes > 0
 
 
-def test_the_ring_of_eight_escs_at_100_hz_fits_into_its_size(tmp_path: Path) -> None:
+def test_ring_of_eight_escs_at_100_hz_fits_into_its_size(tmp_path: Path) -> None:
     """Two ESCs here: the size is proportional to their number."""
     flight = Flight(tmp_path, before_s=30)
     flight.fly(50)

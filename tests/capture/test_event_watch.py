@@ -92,7 +92,7 @@ def test_each_rise_of_an_error_bit_is_an_event() -> None:
     assert it.taken() == ["left: power_stage_overtemp_warning"]
 
 
-def test_a_bit_that_flickers_is_one_event_until_it_is_clear_for_a_second() -> None:
+def test_bit_that_flickers_is_one_event_until_it_is_clear_for_a_second() -> None:
     it = Watched()
     for _ in range(100):
         it.live(errors=UNDERVOLTAGE)
@@ -108,7 +108,7 @@ def test_a_bit_that_flickers_is_one_event_until_it_is_clear_for_a_second() -> No
     assert it.taken() == ["left: undervoltage"]
 
 
-def test_a_bit_that_is_set_in_one_frame_of_a_read_is_noticed() -> None:
+def test_bit_that_is_set_in_one_frame_of_a_read_is_noticed() -> None:
     it = Watched()
     it.live()
     it.frames(LIVE._replace(operating_errors=UNDERVOLTAGE), LIVE)
@@ -137,7 +137,7 @@ def test_self_test_errors_are_events_too() -> None:
     assert it.taken() == ["left: test_short_to_ground"]
 
 
-def test_a_loss_of_telemetry_and_of_the_port_is_one_event_each() -> None:
+def test_loss_of_telemetry_and_of_the_port_is_one_event_each() -> None:
     it = Watched()
     it.live()
     it.silent(1)
@@ -149,7 +149,7 @@ def test_a_loss_of_telemetry_and_of_the_port_is_one_event_each() -> None:
     assert it.taken() == ["left: telemetry lost"]
 
 
-def test_a_bit_that_stays_set_during_a_loss_is_no_new_event() -> None:
+def test_bit_that_stays_set_during_a_loss_is_no_new_event() -> None:
     it = Watched()
     it.live(errors=UNDERVOLTAGE)
     it.silent(1)
@@ -157,7 +157,7 @@ def test_a_bit_that_stays_set_during_a_loss_is_no_new_event() -> None:
     assert it.taken() == ["left: undervoltage", "left: telemetry lost"]
 
 
-def test_a_value_that_crosses_its_limit_in_one_frame_is_an_event() -> None:
+def test_value_that_crosses_its_limit_in_one_frame_is_an_event() -> None:
     it = Watched(RecordConfig(when=("battery_voltage < 20 V", "right.throttle >= 90")))
     it.live()
     it.frames(LIVE._replace(battery_voltage=1999), LIVE)
@@ -189,7 +189,7 @@ def test_noise_at_a_limit_is_one_event_until_the_value_is_good_for_a_second() ->
     assert it.taken() == ["left: battery_voltage < 20"]
 
 
-def test_a_missing_value_is_no_event_and_does_not_arm_a_condition() -> None:
+def test_missing_value_is_no_event_and_does_not_arm_a_condition() -> None:
     it = Watched(RecordConfig(when=("battery_voltage < 20",), errors=()))
     it.silent(3)
     assert it.taken() == []
@@ -200,7 +200,7 @@ def test_a_missing_value_is_no_event_and_does_not_arm_a_condition() -> None:
     assert it.taken() == ["left: battery_voltage < 20", "left: telemetry lost"]
 
 
-def test_a_condition_that_is_met_when_its_value_becomes_known_is_no_event() -> None:
+def test_condition_that_is_met_when_its_value_becomes_known_is_no_event() -> None:
     it = Watched(RecordConfig(when=("battery_voltage < 20",), errors=()))
     _steady(it, 2, battery_voltage=1999)
     assert it.taken() == []
@@ -214,7 +214,7 @@ def test_a_condition_that_is_met_when_its_value_becomes_known_is_no_event() -> N
     assert it.taken() == ["left: battery_voltage < 20"]
 
 
-def test_a_condition_about_the_link_of_an_esc_that_was_never_heard_is_no_event() -> None:
+def test_condition_about_the_link_of_an_esc_that_was_never_heard_is_no_event() -> None:
     it = Watched(RecordConfig(when=("frame_rate < 50", "crc_errors > 5"), errors=()))
     damaged = encode(LIVE, WireLayout.V4)[:-1] + b"x"
     for _ in range(20):

@@ -49,7 +49,7 @@ LIMITS = {
 
 
 @pytest.mark.parametrize("name", LIMITS)
-def test_an_impossible_state_is_refused_in_header_and_entry(name: str, tmp_path: Path) -> None:
+def test_impossible_state_is_refused_in_header_and_entry(name: str, tmp_path: Path) -> None:
     check_state(_with(name, LIMITS[name]))
     for number in (LIMITS[name] + 1, 1 << 100, -1):
         with pytest.raises(ValueError, match="is not a whole number"):
@@ -75,7 +75,7 @@ STREAM = {"counters": [1] * 14, "held": 3, "window": [4, 1, 1, 1, 1, -1, 5]}
         {"late_frames": -1},
     ],
 )
-def test_an_impossible_state_of_a_stream_is_refused(bad: dict[str, Any]) -> None:
+def test_impossible_state_of_a_stream_is_refused(bad: dict[str, Any]) -> None:
     def with_stream(stream: dict[str, Any]) -> dict[str, Any]:
         return GOOD | {"escs": [GOOD["escs"][0] | stream]}  # type: ignore[index]
 
@@ -105,7 +105,7 @@ def test_impossible_counters_of_messages_and_gateway_are_refused(key: str, bad: 
 
 
 @pytest.mark.parametrize("pure", [False, True])
-def test_a_hostile_state_cannot_leave_the_ranges_of_the_core(
+def test_hostile_state_cannot_leave_the_ranges_of_the_core(
     pure: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -161,7 +161,7 @@ def test_counters_of_version_0_5_are_read() -> None:
 
 
 @pytest.mark.parametrize("time_ns", [END_OF_TIME, (1 << 63) - 1])
-def test_an_impossible_time_is_rejected(time_ns: int) -> None:
+def test_impossible_time_is_rejected(time_ns: int) -> None:
     bench = Bench(*made(1)).live(1, 0.5)
     replay = Replay(bench.setup.gateway(bench.layout, START))
     list(replay.follow(bench.entries))

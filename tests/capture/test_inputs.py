@@ -52,7 +52,7 @@ def columns(found: Input) -> dict[str, int]:
     return {field.name: index for index, field in enumerate(found.fields)}
 
 
-def test_a_loss_is_a_row_without_values_until_the_next_frame(tmp_path: Path) -> None:
+def test_loss_is_a_row_without_values_until_the_next_frame(tmp_path: Path) -> None:
     bench = plain_run(15, Faults(dropout=Dropout(2 * SECOND, 6 * SECOND)))
     with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
         at = columns(found)
@@ -88,7 +88,7 @@ def test_rows_of_a_can_log_have_values_while_they_are_fresh(tmp_path: Path) -> N
         assert found.wall_ns(rows[0].time_ns) == pytest.approx(1_700_000_000 * SECOND, abs=2 * MS)
 
 
-def test_a_run_is_selected_by_its_folder_or_the_beginning_of_its_name(tmp_path: Path) -> None:
+def test_run_is_selected_by_its_folder_or_the_beginning_of_its_name(tmp_path: Path) -> None:
     bench = plain_run(1)
     with pytest.raises(UserError, match="has no captures"):
         open_input(tmp_path)
@@ -113,7 +113,7 @@ def test_a_run_is_selected_by_its_folder_or_the_beginning_of_its_name(tmp_path: 
         list(found.samples())
 
 
-def test_a_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: Path) -> None:
+def test_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: Path) -> None:
     bench = plain_run(1)
     (tmp_path / "20260101T000000Z-aaaaaa-00000.kcap").write_bytes(b"")
     capture(tmp_path / "20260101T000000Z-aaaaaa-00001.kcap", bench.setup, bench.entries, part=1)
@@ -138,7 +138,7 @@ def clock_entry(time_ns: int, wall_ns: int) -> Entry:
     )
 
 
-def test_a_changed_wall_clock_applies_to_later_entries(tmp_path: Path) -> None:
+def test_changed_wall_clock_applies_to_later_entries(tmp_path: Path) -> None:
     """Each part of a run begins with the wall clock of its own header."""
     setup = made(1)[0]
     wall = 1_700_000_000 * SECOND

@@ -60,7 +60,7 @@ def test_every_call_of_the_gateway_is_in_the_table() -> None:
     assert not unrecorded(Gateway), "Add a row to CALLS in capture/calls.py"
 
 
-def test_a_new_call_that_is_missing_in_the_table_is_named() -> None:
+def test_new_call_that_is_missing_in_the_table_is_named() -> None:
     class Extended(Gateway):
         def forget_nodes(self, now: int) -> None:
             raise NotImplementedError
@@ -75,7 +75,7 @@ def test_every_kind_of_entry_is_a_call_or_a_note() -> None:
 
 
 @pytest.mark.parametrize(("method", "calls"), [*calls_by_method()])
-def test_the_arguments_of_a_call_are_the_same_after_recording(
+def test_arguments_of_a_call_are_the_same_after_recording(
     method: str, calls: list[RecordedCall]
 ) -> None:
     for given in EXAMPLES.get(method, [(20,)]):
@@ -87,11 +87,11 @@ def test_the_arguments_of_a_call_are_the_same_after_recording(
         assert CALL_OF[EntryKind(entry.kind)].encoding.read(entry) == given
 
 
-def test_a_recorded_gateway_overrides_every_method_of_the_table() -> None:
+def test_recorded_gateway_overrides_every_method_of_the_table() -> None:
     for method, _ in calls_by_method():
         assert getattr(RecordedGateway, method) is not getattr(Gateway, method), method
 
 
-def test_the_numbers_in_c_are_those_of_the_table() -> None:
+def test_numbers_in_c_are_those_of_the_table() -> None:
     for kind in EntryKind:
         assert getattr(KCG, f"ENTRY_{kind.name}") == kind

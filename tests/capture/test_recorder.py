@@ -109,7 +109,7 @@ def test_entries_are_written_in_order(tmp_path: Path) -> None:
     assert bed.it.facts.bytes == file.stat().st_size
 
 
-def test_the_name_of_a_capture_has_the_utc_of_its_first_entry(
+def test_name_of_a_capture_has_the_utc_of_its_first_entry(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -143,7 +143,7 @@ def test_all_parts_of_a_run_together_replay_the_run(tmp_path: Path) -> None:
     recorded(tmp_path, "1 earlier parts of the run are not given")
 
 
-def test_a_new_part_begins_after_the_configured_time(tmp_path: Path) -> None:
+def test_new_part_begins_after_the_configured_time(tmp_path: Path) -> None:
     bed = Bed(tmp_path, part_minutes=1)
     for n in range(3):
         bed.step(*entries(1, n), after_s=31)
@@ -196,7 +196,7 @@ def test_writing_to_a_failed_disk_is_tried_again(
         recorded(folder, "was not closed")
 
 
-def test_a_remark_that_is_not_written_is_repeated(
+def test_remark_that_is_not_written_is_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk fails again in the block that has the number of lost entries."""
@@ -216,7 +216,7 @@ def test_a_remark_that_is_not_written_is_repeated(
     assert lost == 30
 
 
-def test_a_capture_that_is_being_written_is_not_damaged(tmp_path: Path) -> None:
+def test_capture_that_is_being_written_is_not_damaged(tmp_path: Path) -> None:
     bed = Bed(tmp_path)
     assert bed.step(*entries(10)) == ""
     [path] = tmp_path.iterdir()
@@ -231,7 +231,7 @@ def test_a_capture_that_is_being_written_is_not_damaged(tmp_path: Path) -> None:
     bed.closed()
 
 
-def test_an_unusable_folder_is_refused_or_waited_for(tmp_path: Path) -> None:
+def test_unusable_folder_is_refused_or_waited_for(tmp_path: Path) -> None:
     """With ``wait``, the recorder waits for the folder as it does for devices."""
     (tmp_path / "place").touch()
     with pytest.raises(RunError, match=r"record\.directory"):
@@ -258,7 +258,7 @@ def test_only_the_oldest_captures_are_removed(tmp_path: Path) -> None:
     assert all((tmp_path / name).exists() for name in others)
 
 
-def test_a_capture_that_another_gateway_writes_is_kept(tmp_path: Path) -> None:
+def test_capture_that_another_gateway_writes_is_kept(tmp_path: Path) -> None:
     """Two gateways use one folder, and the older file is still open."""
     first = Bed(tmp_path)
     first.step(*entries(5))
@@ -275,7 +275,7 @@ def test_a_capture_that_another_gateway_writes_is_kept(tmp_path: Path) -> None:
     first.it.close()
 
 
-def test_a_blocked_disk_is_reported_and_lost_entries_are_counted(
+def test_blocked_disk_is_reported_and_lost_entries_are_counted(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -348,7 +348,7 @@ def test_no_file_is_overwritten_and_no_link_is_followed(
     assert target.read_text() == "precious"
 
 
-def test_a_changed_wall_clock_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changed_wall_clock_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shift = 1_700_000_000 * SECOND
     bed = Bed(tmp_path)
     monkeypatch.setattr(time, "time_ns", lambda: bed.now + shift)
@@ -363,7 +363,7 @@ def test_a_changed_wall_clock_is_recorded(tmp_path: Path, monkeypatch: pytest.Mo
     assert walls[1] - walls[0] == 3622 * SECOND
 
 
-def test_a_damaged_header_is_replaced_by_its_copy(tmp_path: Path) -> None:
+def test_damaged_header_is_replaced_by_its_copy(tmp_path: Path) -> None:
     bed = Bed(tmp_path)
     bed.step(*entries(50))
     bed.step(*entries(50, 50))

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.promise("replay")
 PROGRAM = [sys.executable, "-m", "kontronik_can_gw"]
 
 
-def test_a_can_log_is_refused_because_it_has_no_bytes_of_escs(tmp_path: Path) -> None:
+def test_can_log_is_refused_because_it_has_no_bytes_of_escs(tmp_path: Path) -> None:
     log = written(tmp_path / "a.log", "(1.000000) can0 688#0000000000000000\n")
     assert "which has no bytes of ESCs" in refused(2, "replay", log, "--on", "pty")
 
@@ -34,7 +34,7 @@ def playing(*words: object) -> Iterator[subprocess.Popen[str]]:
         yield player
 
 
-def test_a_replay_stops_immediately_at_sigint(tmp_path: Path) -> None:
+def test_replay_stops_immediately_at_sigint(tmp_path: Path) -> None:
     bench = Bench(*made(1))
     bench.gateway.start(START)
     bench.take(START)
@@ -50,7 +50,7 @@ def test_a_replay_stops_immediately_at_sigint(tmp_path: Path) -> None:
         assert "stopped" in player.stderr.read()
 
 
-def test_a_terminal_receives_the_bytes_of_its_esc(tmp_path: Path) -> None:
+def test_terminal_receives_the_bytes_of_its_esc(tmp_path: Path) -> None:
     bench = Bench(*made(2)).live(5, 2)
     path = capture(tmp_path / "a.kcap", bench.setup, bench.entries)
     found = bytearray()

@@ -75,14 +75,14 @@ def test_frames_and_times_of_a_replay_equal_the_live_ones(
     assert received > 3
 
 
-def test_a_replay_is_quiet_at_the_same_times_as_the_live_gateway() -> None:
+def test_replay_is_quiet_at_the_same_times_as_the_live_gateway() -> None:
     bench = Bench(*made(2, quiet_after_s=1)).live(1, 12)
     assert bench.quiet_turns > 50
     frames = replayed(bench)
     assert [frame for frame in frames if not frame.received] == bench.sent
 
 
-def test_a_replay_that_begins_in_quiet_mode_is_quiet_at_once() -> None:
+def test_replay_that_begins_in_quiet_mode_is_quiet_at_once() -> None:
     """The file before it is missing, so only the state in the header has the time."""
     bench = Bench(*made(2, quiet_after_s=1))
     run = bench.running(1, wild=False)
@@ -152,7 +152,7 @@ def test_frames_that_waited_when_the_state_was_noted_count_as_sent() -> None:
     assert later.status.sent_frames == gateway.status.sent_frames
 
 
-def test_a_marked_replay_differs_only_in_the_state() -> None:
+def test_marked_replay_differs_only_in_the_state() -> None:
     bench = Bench(*made(1)).live(3, 4, wild=False)
     found = bench.setup.database()
     assert found is not None
@@ -194,7 +194,7 @@ def _copy_in_version_2(old: Path, new: Path) -> None:
 
 
 @pytest.mark.parametrize("path", OF_0_5_0, ids=lambda path: path.stem)
-def test_a_capture_of_0_5_0_is_replayed_in_the_current_order(path: Path, tmp_path: Path) -> None:
+def test_capture_of_0_5_0_is_replayed_in_the_current_order(path: Path, tmp_path: Path) -> None:
     """Only version 2 counts a lost port as a loss of telemetry."""
     _copy_in_version_2(path, tmp_path / "new.kcap")
     with open_input(path) as old, open_input(tmp_path / "new.kcap") as new:

@@ -42,7 +42,7 @@ def test_json_contains_keys_and_warnings_or_the_mistakes(tmp_path: Path) -> None
     assert [".pole_pair" in line for line in json.loads(done.out)["mistakes"]] == [True, False]
 
 
-def test_the_details_are_the_keys_in_effect_and_the_tables(tmp_path: Path) -> None:
+def test_details_are_the_keys_in_effect_and_the_tables(tmp_path: Path) -> None:
     file = written(tmp_path / "g.toml", f"{LEAST}[dronecan]\nenabled = true\n")
     found = run("check", "-v", file).out.splitlines()
     short = run("check", file).out.splitlines()
@@ -55,7 +55,7 @@ def test_the_details_are_the_keys_in_effect_and_the_tables(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("command", ["check", "doctor", "run"])
-def test_the_folders_configuration_is_preferred_to_the_machines(
+def test_folders_configuration_is_preferred_to_the_machines(
     places: tuple[Path, Path], command: str
 ) -> None:
     own, machine = places
@@ -87,7 +87,7 @@ def test_commands_report_the_configuration_that_they_found(places: tuple[Path, P
     assert "run -c gateway.toml" in refused(3, "status")
 
 
-def test_the_fingerprint_identifies_the_layout_in_file_and_frames(
+def test_fingerprint_identifies_the_layout_in_file_and_frames(
     places: tuple[Path, Path],
 ) -> None:
     own, _ = places
@@ -115,7 +115,7 @@ def test_the_fingerprint_identifies_the_layout_in_file_and_frames(
         (2, "decode gateway.toml"),
     ],
 )
-def test_an_unreadable_file_is_reported_in_one_line(
+def test_unreadable_file_is_reported_in_one_line(
     places: tuple[Path, Path],
     code: int,
     words: str,
@@ -131,7 +131,7 @@ def test_an_unreadable_file_is_reported_in_one_line(
     assert "Permission denied" in said
 
 
-def test_the_usual_and_the_worst_bus_load_are_shown(tmp_path: Path) -> None:
+def test_usual_and_the_worst_bus_load_are_shown(tmp_path: Path) -> None:
     """EscStatus of the shipped DBC is sent every 100 ms and on change; TPDO 4 on change."""
     file = written(tmp_path / "g.toml", f"{LEAST}[canopen]\nenabled = true\nstore = 'x'\n")
     found = json.loads(run("check", "--json", file).out)
@@ -160,7 +160,7 @@ def test_toml_beyond_the_limits_of_python_is_explained_to_users(text: str, tmp_p
         (b"\xff", "the password is not UTF-8 text"),
     ],
 )
-def test_a_bad_password_file_is_explained_to_users(
+def test_bad_password_file_is_explained_to_users(
     content: bytes | None,
     said: str,
     tmp_path: Path,
@@ -176,7 +176,7 @@ def test_a_bad_password_file_is_explained_to_users(
     ("content", "said"),
     [(None, "cannot be read: No such file or directory"), (b"x", "cannot be used for TLS")],
 )
-def test_a_bad_certificate_is_explained_to_users(
+def test_bad_certificate_is_explained_to_users(
     content: bytes | None,
     said: str,
     tmp_path: Path,

@@ -48,14 +48,14 @@ def terminal() -> Iterator[PtyEsc]:
 
 @pytest.mark.promise("removed")
 @pytest.mark.parametrize("words", ["replay a --on=tape --to=tape", "replay -h --to tape"])
-def test_a_removed_option_is_refused_with_its_replacement(words: str) -> None:
+def test_removed_option_is_refused_with_its_replacement(words: str) -> None:
     assert refused(2, *words.split()).startswith("--to: was removed. Type --on can or --on pty. ")
     assert "unrecognized arguments: --to" in refused(2, "schema", "--to")
     assert "does not exist" in refused(2, "decode", "--", "--stats")
 
 
 @pytest.mark.parametrize("words", ["describe --form json", "service install --root . --chan can1"])
-def test_an_abbreviated_option_is_refused(words: str) -> None:
+def test_abbreviated_option_is_refused(words: str) -> None:
     """In a script an abbreviation could mean another option after an update."""
     assert f"unrecognized arguments: {words.split()[-2]}" in refused(2, *words.split())
 
@@ -77,7 +77,7 @@ def test_removed_options_are_not_in_use_again() -> None:
         ("monitor my.dbc", "is a DBC, not a recording. Give it with --dbc my.dbc."),
     ],
 )
-def test_a_file_that_needs_an_option_names_the_option(words: str, said: str) -> None:
+def test_file_that_needs_an_option_names_the_option(words: str, said: str) -> None:
     assert said in refused(2, *words.split())
 
 
@@ -112,7 +112,7 @@ def forbidden(path: str, mode: int) -> list[str]:
     ("mode", "remedy"),
     [(0o660, "Join its group: sudo usermod -aG {} $USER"), (0o600, "chmod g+rw")],
 )
-def test_a_port_without_permission_is_reported_with_the_group_to_join(
+def test_port_without_permission_is_reported_with_the_group_to_join(
     tmp_path: Path,
     terminal: PtyEsc,
     mode: int,
@@ -162,7 +162,7 @@ LONG = "x" * 300
         *(f"monitor {LONG}", f"dbc -o {LONG}", f"check {LONG}", f"service install --root {LONG}"),
     ],
 )
-def test_a_name_that_is_too_long_is_reported_in_one_line(
+def test_name_that_is_too_long_is_reported_in_one_line(
     words: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -174,7 +174,7 @@ def test_a_name_that_is_too_long_is_reported_in_one_line(
     assert "File name too long" in done.err
 
 
-def test_a_missing_can_interface_is_reported_with_the_command_to_create_it(
+def test_missing_can_interface_is_reported_with_the_command_to_create_it(
     tmp_path: Path, terminal: PtyEsc
 ) -> None:
     file = configuration(tmp_path, terminal.path, can='channel = "nocan7"')
@@ -189,7 +189,7 @@ def test_a_missing_can_interface_is_reported_with_the_command_to_create_it(
 # --- dbc
 
 
-def test_a_dbc_is_written_into_a_pipe_and_replaces_a_link_with_force(tmp_path: Path) -> None:
+def test_dbc_is_written_into_a_pipe_and_replaces_a_link_with_force(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     reader = subprocess.Popen(["cat", str(pipe)], stdout=subprocess.PIPE, text=True)
@@ -226,14 +226,14 @@ def shell(command: str) -> Done:
 
 @pytest.mark.promise("closed-ends")
 @pytest.mark.parametrize("words", ["schema", "init -", "dbc --esc 1"])
-def test_a_full_disk_at_standard_output_is_reported_in_one_line(words: str) -> None:
+def test_full_disk_at_standard_output_is_reported_in_one_line(words: str) -> None:
     done = shell(f"PROGRAM {words} >/dev/full")
     assert done.returncode == 1, done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
     assert "standard output: cannot be written: No space left on device" in done.stderr
 
 
-def test_a_closed_standard_output_causes_no_traceback(
+def test_closed_standard_output_causes_no_traceback(
     tmp_path: Path,
 ) -> None:
     done = shell(f"exec PROGRAM init {tmp_path}/a.toml >&-")
@@ -248,7 +248,7 @@ def test_a_closed_standard_output_causes_no_traceback(
 
 
 @pytest.mark.promise("removed")
-def test_the_lines_that_replace_removed_options_are_accepted() -> None:
+def test_lines_that_replace_removed_options_are_accepted() -> None:
     advice = " ".join(REMOVED_OPTIONS.values())
     lines = set(
         re.findall(r"(?:[Tt]ype|by) kontronik-can-gw ([a-z](?:'[^']*'|\.\w|[^.:;,'])*)", advice)
@@ -269,7 +269,7 @@ def test_the_lines_that_replace_removed_options_are_accepted() -> None:
 
 @pytest.mark.promise("one-device")
 @pytest.mark.parametrize("words", ["mqtt --broker x", "replay x.bin --on can"])
-def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
+def test_port_of_an_esc_is_never_opened_as_a_can_adapter(
     words: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -297,11 +297,11 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
         ),
     ],
 )
-def test_a_time_that_is_too_long_is_refused(words: str, said: str) -> None:
+def test_time_that_is_too_long_is_refused(words: str, said: str) -> None:
     assert f": {said}. Help: " in refused(2, *words.split())
 
 
-def test_an_export_that_cannot_be_written_has_a_remedy(tmp_path: Path) -> None:
+def test_export_that_cannot_be_written_has_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     folder = tmp_path / "file" / "out"
     said = refused(1, "export", "c", folder)

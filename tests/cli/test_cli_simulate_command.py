@@ -32,7 +32,7 @@ def written(tmp_path: Path, words: str) -> list[Frame]:
     return frames_of(file.read_bytes())
 
 
-def test_a_file_and_standard_output_get_the_simulators_bytes(tmp_path: Path) -> None:
+def test_file_and_standard_output_get_the_simulators_bytes(tmp_path: Path) -> None:
     words = ["simulate", "--seconds", "90", "--seed", "5", "--out"]
     file = tmp_path / "out.bin"
     assert run(*words, file).code == 0
@@ -94,7 +94,7 @@ def test_escs_on_terminals_are_listed_and_send_until_a_signal(
 
 
 @pytest.mark.promise("silent-to-esc")
-def test_a_gateway_that_transmits_to_the_esc_is_reported() -> None:
+def test_gateway_that_transmits_to_the_esc_is_reported() -> None:
     pipe = subprocess.PIPE
     with subprocess.Popen(COMMAND, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout
@@ -111,7 +111,7 @@ def test_a_gateway_that_transmits_to_the_esc_is_reported() -> None:
     assert process.returncode == 1
 
 
-def test_a_regular_file_in_place_of_the_link_is_not_replaced(tmp_path: Path) -> None:
+def test_regular_file_in_place_of_the_link_is_not_replaced(tmp_path: Path) -> None:
     link = tmp_path / "esc2"
     link.write_text("precious")
     said = refused(1, "simulate", "--esc", "2", "--link", tmp_path / "esc{n}", "--seconds", "1")

@@ -88,7 +88,7 @@ def closed(
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_a_command_without_a_reader_ends_silently(words: str, folder: Path) -> None:
+def test_command_without_a_reader_ends_silently(words: str, folder: Path) -> None:
     done = closed(words, folder, has_closed_stderr=False)
     lines = [line for line in done.stderr.splitlines() if not line.endswith(ADDRESS_NOTE)]
     assert [line for line in lines if line not in NOTES] == []

@@ -64,7 +64,7 @@ def values(dictionary: Any) -> dict[Key, int | bytes]:
     return found
 
 
-def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
+def test_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
     assert command("-o", tmp_path / "out.eds")[0] == 0
     shipped_eds = EDS.read_bytes()
     _, printed, _ = command()
@@ -81,7 +81,7 @@ def test_the_eds_of_a_configuration_is_the_one_in_use(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("output", "named"), [("left.dcf", "left.dcf"), ("mötor.dcf", "mine_1.dcf")]
 )
-def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
+def test_dcf_names_itself_and_the_eds_it_was_made_from(
     tmp_path: Path,
     output: str,
     named: str,
@@ -99,7 +99,7 @@ def test_a_dcf_names_itself_and_the_eds_it_was_made_from(
     ]
 
 
-def test_the_node_answers_with_the_values_of_the_dcf() -> None:
+def test_node_answers_with_the_values_of_the_dcf() -> None:
     """The values encoded by the canopen library are equal to the data of SDO uploads."""
     node = shipped_canopen([5]).nodes([EscSettings()]).nodes[0]
     made = command("--node-id", 5)[1]

@@ -113,12 +113,12 @@ def refused(code: int, words: str, name: str) -> None:
 
 
 @pytest.mark.parametrize(("command", "kind", "_wrong"), INPUTS)
-def test_an_input_that_does_not_exist_has_exit_code_2(command: str, kind: str, _wrong: str) -> None:
+def test_input_that_does_not_exist_has_exit_code_2(command: str, kind: str, _wrong: str) -> None:
     refused(2, command.format(f=f"none.{kind}"), f"none.{kind}")
 
 
 @pytest.mark.parametrize(("command", "kind", "wrong"), INPUTS)
-def test_an_input_of_another_kind_has_exit_code_2(
+def test_input_of_another_kind_has_exit_code_2(
     command: str,
     kind: str,
     wrong: str,
@@ -129,7 +129,7 @@ def test_an_input_of_another_kind_has_exit_code_2(
 
 
 @pytest.mark.parametrize(("command", "kind", "_wrong"), INPUTS)
-def test_an_input_that_is_a_folder_has_exit_code_2(
+def test_input_that_is_a_folder_has_exit_code_2(
     command: str,
     kind: str,
     _wrong: str,
@@ -140,7 +140,7 @@ def test_an_input_that_is_a_folder_has_exit_code_2(
 
 
 @pytest.mark.parametrize(("command", "kind", "_wrong"), INPUTS)
-def test_an_input_without_read_permission_has_exit_code_2(
+def test_input_without_read_permission_has_exit_code_2(
     command: str,
     kind: str,
     _wrong: str,
@@ -159,7 +159,7 @@ def test_an_input_without_read_permission_has_exit_code_2(
 
 
 @pytest.mark.parametrize("command", OUTPUTS)
-def test_an_output_that_cannot_be_written_has_exit_code_1(command: str) -> None:
+def test_output_that_cannot_be_written_has_exit_code_1(command: str) -> None:
     refused(1, command.format(f="x.bin/out"), "x.bin")
     if not command.startswith("export"):
         refused(1, command.format(f="none/out"), "none/out")

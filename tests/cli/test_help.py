@@ -61,7 +61,7 @@ def test_dronecan_is_named_in_every_description_of_the_program() -> None:
     assert [name for name, text in texts.items() if "DroneCAN" not in text] == []
 
 
-def test_a_call_without_arguments_shows_the_short_help() -> None:
+def test_call_without_arguments_shows_the_short_help() -> None:
     done = run()
     assert done.code == 2
     assert done.out == ""
@@ -95,7 +95,7 @@ def test_a_call_without_arguments_shows_the_short_help() -> None:
         ("convert a b --forse", " convert", "--forse. Did you mean --force? Help: "),
     ],
 )
-def test_a_mistyped_command_line_is_one_line_with_a_suggestion(
+def test_mistyped_command_line_is_one_line_with_a_suggestion(
     words: str,
     place: str,
     said: str,
@@ -110,7 +110,7 @@ def test_a_mistyped_command_line_is_one_line_with_a_suggestion(
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_an_unknown_option_names_the_help_of_the_command(name: str) -> None:
+def test_unknown_option_names_the_help_of_the_command(name: str) -> None:
     required = {
         "service": ["install"],
         "completion": ["bash"],

@@ -48,7 +48,7 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_file_that_exists_is_replaced_only_with_force(command: str, folder: Path) -> None:
+def test_file_that_exists_is_replaced_only_with_force(command: str, folder: Path) -> None:
     words = command.format(o="out").split()
     assert run(*words).code == 0
     first = (folder / "out").read_bytes()
@@ -65,7 +65,7 @@ def test_a_file_that_exists_is_replaced_only_with_force(command: str, folder: Pa
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_an_output_that_cannot_be_written_leaves_no_file(command: str, folder: Path) -> None:
+def test_output_that_cannot_be_written_leaves_no_file(command: str, folder: Path) -> None:
     before = names(folder)
     for output, code in (
         ("none/out", 1),
@@ -101,7 +101,7 @@ def test_an_output_that_cannot_be_written_leaves_no_file(command: str, folder: P
         ("report -c gateway.toml x.bin -o {o}", "own.dbc"),
     ],
 )
-def test_an_input_is_never_overwritten(command: str, source: str, way: str, folder: Path) -> None:
+def test_input_is_never_overwritten(command: str, source: str, way: str, folder: Path) -> None:
     assert run("eds", "-o", "own.eds").code == 0
     nodes = CONFIGURATION + '[canopen]\nenabled = true\neds = "own.eds"\n'
     written(folder / "nodes.toml", nodes)
@@ -125,7 +125,7 @@ def test_an_input_is_never_overwritten(command: str, source: str, way: str, fold
     assert path.read_bytes() == before
 
 
-def test_an_export_replaces_files_only_with_force_and_never_its_input(folder: Path) -> None:
+def test_export_replaces_files_only_with_force_and_never_its_input(folder: Path) -> None:
     assert run("export", "c", "-o", "fw").code == 0
     (folder / "fw" / "example_main.c").write_text("mine")
     done = run("export", "c", "--dbc", "own.dbc", "fw")
@@ -142,7 +142,7 @@ def test_an_export_replaces_files_only_with_force_and_never_its_input(folder: Pa
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_part_that_exists_is_replaced_only_with_force(command: str, folder: Path) -> None:
+def test_part_that_exists_is_replaced_only_with_force(command: str, folder: Path) -> None:
     part = written(folder / "out.part", "rows of an interrupted command")
     done = run(*command.format(o="out").split())
     assert done.code == 2
@@ -157,7 +157,7 @@ def test_a_part_that_exists_is_replaced_only_with_force(command: str, folder: Pa
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_part_that_is_being_written_is_never_replaced(command: str, folder: Path) -> None:
+def test_part_that_is_being_written_is_never_replaced(command: str, folder: Path) -> None:
     part = folder / "out.part"
     with part.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -169,7 +169,7 @@ def test_a_part_that_is_being_written_is_never_replaced(command: str, folder: Pa
     assert not (folder / "out").exists()
 
 
-def test_a_file_that_appears_during_writing_is_kept(
+def test_file_that_appears_during_writing_is_kept(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def appear(_fd: int) -> None:
@@ -184,7 +184,7 @@ def test_a_file_that_appears_during_writing_is_kept(
     assert (folder / "out.part").stat().st_size > 1000
 
 
-def test_the_rows_of_a_killed_conversion_survive_the_same_command(folder: Path) -> None:
+def test_rows_of_a_killed_conversion_survive_the_same_command(folder: Path) -> None:
     command = [*PROGRAM, "convert", "-", "live.csv"]
     part = folder / "live.csv.part"
     rows = (folder / "x.bin").read_bytes()
@@ -209,7 +209,7 @@ def test_the_rows_of_a_killed_conversion_survive_the_same_command(folder: Path) 
     assert part.read_bytes() == kept
 
 
-def test_an_export_to_a_full_disk_leaves_the_folder_as_it_was(
+def test_export_to_a_full_disk_leaves_the_folder_as_it_was(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fill_up(count: int) -> None:
@@ -254,7 +254,7 @@ def test_two_outputs_are_refused_and_so_is_a_missing_output() -> None:
         signal.SIGHUP,
     ],
 )
-def test_a_signal_leaves_no_partly_written_file(number: int, folder: Path) -> None:
+def test_signal_leaves_no_partly_written_file(number: int, folder: Path) -> None:
     before = names(folder)
     command = [*PROGRAM, "simulate", "--seconds", "1000h", "-o", "long.bin"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
@@ -271,7 +271,7 @@ def test_a_signal_leaves_no_partly_written_file(number: int, folder: Path) -> No
     assert names(folder) == before
 
 
-def test_a_full_disk_leaves_no_partly_written_file(
+def test_full_disk_leaves_no_partly_written_file(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_fd: int) -> None:

@@ -52,7 +52,7 @@ def test_printed_lines_and_errors_are_cleaned(capsys: pytest.CaptureFixture[str]
     assert UserError(EVIL, "b").problems == (SHOWN, "b")
 
 
-def test_a_log_message_stays_one_line() -> None:
+def test_log_message_stays_one_line() -> None:
     stream = io.StringIO()
     handler = BackgroundHandler(stream, longest_end_s=60)
     try:
@@ -101,9 +101,7 @@ def test_descriptions_of_hostile_files_are_cleaned(words: list[str], folder: Pat
     assert is_clean(done.out + done.err)
 
 
-def test_a_file_shown_on_a_terminal_is_cleaned(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_file_shown_on_a_terminal_is_cleaned(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for is_terminal in (False, True):  # text in a pipe is not changed
         out = io.TextIOWrapper(io.BytesIO(), "utf-8")
         monkeypatch.setattr(out, "isatty", lambda is_terminal=is_terminal: is_terminal)

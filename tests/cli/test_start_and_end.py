@@ -81,7 +81,7 @@ def test_ctrl_c_while_modules_are_loaded_ends_silently(
     assert (done.returncode, done.stderr) in ((-signal.SIGINT, ""), (130, ""))
 
 
-def test_an_ignored_ctrl_c_does_not_end_the_program(folder: Path) -> None:
+def test_ignored_ctrl_c_does_not_end_the_program(folder: Path) -> None:
     """Ctrl-C is ignored as in background jobs of a shell script."""
     code = "import signal; signal.signal(2, signal.SIG_IGN)\n" + INTERRUPTED
     code = code.format(
@@ -152,7 +152,7 @@ def test_ctrl_c_while_a_mistake_is_reported_causes_no_traceback(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_a_gateway_that_waits_for_its_configuration(
+def test_signal_ends_a_gateway_that_waits_for_its_configuration(
     number: signal.Signals,
     folder: Path,
 ) -> None:
@@ -182,7 +182,7 @@ def test_a_signal_ends_a_gateway_that_waits_for_its_configuration(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_signal_that_arrives_in_a_finalizer_still_ends_the_command(
+def test_signal_that_arrives_in_a_finalizer_still_ends_the_command(
     number: signal.Signals, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Python ignores an exception there, so the signal would be lost."""

@@ -87,7 +87,7 @@ def problems(given_tables: Any) -> list[str]:
         ("x" * 300 + "<", "is not a condition such as"),
     ],
 )
-def test_a_wrong_condition_is_one_clear_mistake(text: str, problem: str) -> None:
+def test_wrong_condition_is_one_clear_mistake(text: str, problem: str) -> None:
     [found] = problems(tables("record", "when", [text]))
     assert found.startswith("a.toml: record.when: ")
     assert problem in found
@@ -103,7 +103,7 @@ def test_all_wrong_conditions_and_error_bits_are_named_at_once() -> None:
     assert errors.endswith("Did you mean undervoltage?")
 
 
-def test_a_limit_is_converted_to_the_unit_of_the_value() -> None:
+def test_limit_is_converted_to_the_unit_of_the_value() -> None:
     for text, limit in (
         ("battery_voltage<20", 20.0),
         ("BatteryVoltage < 20500 mV", 20.5),
@@ -443,7 +443,7 @@ def test_no_mistake_of_any_key_has_a_value_as_python_writes_it() -> None:
         ("esc", "gear", "1/2/3", '"1/2/3" is neither a number, 0.001 to 1000, nor "numerator'),
     ],
 )
-def test_a_refused_value_is_shown_as_toml_with_range_and_unit(
+def test_refused_value_is_shown_as_toml_with_range_and_unit(
     table: str, key: str, value: Any, said: str
 ) -> None:
     (line,) = problems(tables(table, key, value))
@@ -453,7 +453,7 @@ def test_a_refused_value_is_shown_as_toml_with_range_and_unit(
 @pytest.mark.parametrize(
     ("key", "value"), [("before_s", 3), ("after_s", 3), ("when", ["battery_voltage < 20"])]
 )
-def test_a_key_of_events_without_on_event_has_a_warning(key: str, value: Any) -> None:
+def test_key_of_events_without_on_event_has_a_warning(key: str, value: Any) -> None:
     (line,) = parse(tables("record", key, value), "a.toml").warnings
     assert line == f"a.toml: record.{key}: has no effect without record.on_event = true"
     on = tables() | {"record": {key: value, "on_event": True, "directory": "d"}}

@@ -22,7 +22,7 @@ def verdicts(slave: Slave, *names: str) -> dict[str, str]:
     return {result.item.name: result.verdict.value for result in run(slave, items, {})}
 
 
-def test_a_conforming_slave_passes_all_items() -> None:
+def test_conforming_slave_passes_all_items() -> None:
     found = verdicts(simulated_slave())
     assert len(found) == len(all_items())
     failed = {name for name, verdict in found.items() if verdict != ItemVerdict.PASSED.value}
@@ -30,7 +30,7 @@ def test_a_conforming_slave_passes_all_items() -> None:
 
 
 @pytest.mark.parametrize("broken", BROKEN, ids=lambda broken: broken.name)
-def test_a_broken_slave_fails_the_item_about_its_fault(broken: BrokenSlave) -> None:
+def test_broken_slave_fails_the_item_about_its_fault(broken: BrokenSlave) -> None:
     slave = simulated_slave(broken.from_master, broken.from_node)
     assert verdicts(slave, broken.item) == {broken.item: "failed"}
 
@@ -54,7 +54,7 @@ def test_silence_of_a_service_that_does_not_work_is_not_passed() -> None:
     assert set(found.values()) == {"not supported"}
 
 
-def test_a_size_that_is_not_indicated_is_no_fault() -> None:
+def test_size_that_is_not_indicated_is_no_fault() -> None:
     """CiA 301 allows expedited uploads without a size."""
 
     def hide_size(frame: CanFrame, _proxy: Proxy) -> list[CanFrame]:
@@ -69,7 +69,7 @@ def test_a_size_that_is_not_indicated_is_no_fault() -> None:
     }
 
 
-def test_an_upload_by_segments_instead_of_blocks_is_named() -> None:
+def test_upload_by_segments_instead_of_blocks_is_named() -> None:
     """LocalNode answers a block upload with a segmented one, which was not permitted."""
 
     def answer_by_segments(frame: CanFrame, _proxy: Proxy) -> list[CanFrame]:

@@ -74,7 +74,7 @@ def conformance(channel: str, *words: object) -> tuple[object, dict[str, str], s
     return done.code, verdicts, done.err
 
 
-def test_the_gaps_of_an_incomplete_slave_are_found(tmp_path: Path) -> None:
+def test_gaps_of_an_incomplete_slave_are_found(tmp_path: Path) -> None:
     table = tmp_path / "report.md"
     results = tmp_path / "results.xml"
     with local_node("gaps", 5):
@@ -95,7 +95,7 @@ def test_the_gaps_of_an_incomplete_slave_are_found(tmp_path: Path) -> None:
     assert int(suite.attrib["failures"]) == len(failed) == len(suite.findall("testcase/failure"))
 
 
-def test_a_deviation_with_a_reason_is_not_a_failure(tmp_path: Path) -> None:
+def test_deviation_with_a_reason_is_not_a_failure(tmp_path: Path) -> None:
     deviations = tmp_path / "deviations.toml"
     deviations.write_text('nmt-boot-up-after-reset-node = "it has no boot-up message"\n')
     with local_node("deviation", 1):
@@ -118,7 +118,7 @@ def test_reasons_of_the_gateway_apply_only_to_its_own_eds(tmp_path: Path) -> Non
         assert (code, [*verdicts.values()]) == (1, ["failed"])
 
 
-def test_a_slave_that_stores_nothing_is_no_failure(tmp_path: Path) -> None:
+def test_slave_that_stores_nothing_is_no_failure(tmp_path: Path) -> None:
     words = ("--only", "store-capability", "--only", "store-and-restore")
     with local_node("no_store", 1) as node:
         dictionary: Any = node.object_dictionary
@@ -152,19 +152,19 @@ def test_wrong_usage_is_refused(
         ("nmt-start", "is not valid TOML"),
     ],
 )
-def test_a_wrong_file_of_deviations_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_wrong_file_of_deviations_is_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "deviations.toml"
     path.write_text(text)
     assert message in refused(2, "conformance", "--deviations", path)
 
 
-def test_a_file_that_is_not_an_eds_is_refused(tmp_path: Path) -> None:
+def test_file_that_is_not_an_eds_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.eds"
     path.write_text("[FileInfo]\nFileName=x.eds\n")
     assert "does not have the object 1000h" in refused(2, "conformance", "--eds", path)
 
 
-def test_a_slave_that_does_not_answer_is_reported() -> None:
+def test_slave_that_does_not_answer_is_reported() -> None:
     said = refused(1, "conformance", "--interface", "virtual", "--channel", "empty", "--limit", 0.1)
     assert "node 1 on empty: does not answer. Is it on this bus" in said
 
@@ -189,7 +189,7 @@ def test_other_nodes_on_the_bus_prevent_lss() -> None:
     assert verdicts == {"lss-switch-global": "not supported"}
 
 
-def test_the_list_has_each_item_with_its_clause() -> None:
+def test_list_has_each_item_with_its_clause() -> None:
     assert "conformance" in COMMANDS
     lines = run("conformance", "--list").out.splitlines()
     assert len(lines) == len(all_items()) >= 90

@@ -46,9 +46,7 @@ def verdicts(eds: EdsFile, *words: str, bench: Bench | None = None) -> dict[str,
         ("[FileInfo]", "\ufeff[FileInfo]"),
     ],
 )
-def test_an_empty_entry_a_comment_and_a_mark_are_accepted(
-    tmp_path: Path, old: str, new: str
-) -> None:
+def test_empty_entry_a_comment_and_a_mark_are_accepted(tmp_path: Path, old: str, new: str) -> None:
     eds = read_eds(eds_with(tmp_path, (old, new)), 1)
     assert set(verdicts(eds, "od-identity", "od-values", "eds-").values()) == {"passed"}
 
@@ -61,7 +59,7 @@ def test_dummy_objects_are_not_read(tmp_path: Path) -> None:
     }
 
 
-def test_an_eds_without_device_info_is_judged(tmp_path: Path) -> None:
+def test_eds_without_device_info_is_judged(tmp_path: Path) -> None:
     text = EDS.read_text()
     begin = text.index("[DeviceInfo]")
     end = text.index("[", begin + 1)
@@ -87,12 +85,12 @@ def test_an_eds_without_device_info_is_judged(tmp_path: Path) -> None:
         ("[1017]\r\n", "[1017]\r\nx\r\n", "[1017] 'x' is neither a section, nor key=value"),
     ],
 )
-def test_a_mistake_names_section_and_key(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_mistake_names_section_and_key(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = eds_with(tmp_path, (old, new))
     assert f"{path}: {message}" in refused(2, "conformance", "--eds", path)
 
 
-def test_a_vendor_id_of_your_own_passes_with_its_eds(tmp_path: Path) -> None:
+def test_vendor_id_of_your_own_passes_with_its_eds(tmp_path: Path) -> None:
     path = tmp_path / "mine.eds"
     path.write_bytes(with_vendor_id(EDS.read_bytes(), 0x319))
     bench = Bench(
@@ -106,7 +104,7 @@ def test_a_vendor_id_of_your_own_passes_with_its_eds(tmp_path: Path) -> None:
     assert len(found) == 3
 
 
-def test_an_eds_without_defaults_is_judged(tmp_path: Path) -> None:
+def test_eds_without_defaults_is_judged(tmp_path: Path) -> None:
     lines = EDS.read_text().splitlines()
     path = tmp_path / "x.eds"
     path.write_text("\n".join(line for line in lines if not line.startswith("DefaultValue")))

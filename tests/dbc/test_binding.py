@@ -64,7 +64,7 @@ def float_of(signal: Sig, bind: float | None = None, live: LiveData = LIVE) -> f
 # --- names
 
 
-def test_a_longer_prefix_wins_over_a_shorter_one_and_a_source_over_a_prefix() -> None:
+def test_longer_prefix_wins_over_a_shorter_one_and_a_source_over_a_prefix() -> None:
     binder = Binder([EscSettings("left"), EscSettings("left_rear"), EscSettings("l")], {})
     found = binder.by_name("LeftRearBatteryVoltage")
     assert found is not None
@@ -77,12 +77,12 @@ def test_a_longer_prefix_wins_over_a_shorter_one_and_a_source_over_a_prefix() ->
 # --- [dbc.bind]
 
 
-def test_a_binding_overrides_the_name_of_the_signal() -> None:
+def test_binding_overrides_the_name_of_the_signal() -> None:
     throttle = Sig("Throttle", 0, 16, unit="V", factor="0.01")
     assert raw_of(throttle, "battery_voltage") == 4442
 
 
-def test_a_binding_with_the_message_overrides_one_of_the_signal_alone() -> None:
+def test_binding_with_the_message_overrides_one_of_the_signal_alone() -> None:
     voltage = Sig("U", 0, 16)
     messages = [
         Msg("A", 1, 8, [voltage]),
@@ -124,19 +124,19 @@ def test_bindings_of_a_one_esc_layout_apply_to_every_esc() -> None:
         (Sig("X", 0, 8, minimum="0", maximum="10"), 255, 255),
     ],
 )
-def test_a_constant_is_sent_as_its_physical_value(signal: Sig, constant: float, raw: int) -> None:
+def test_constant_is_sent_as_its_physical_value(signal: Sig, constant: float, raw: int) -> None:
     assert raw_of(signal, constant) == raw
 
 
 @pytest.mark.parametrize("length", [32, 64])
-def test_a_constant_in_a_float_is_sent_as_a_float(length: int) -> None:
+def test_constant_in_a_float_is_sent_as_a_float(length: int) -> None:
     assert float_of(Sig("X", 0, length, factor="0.5"), -3) == -6.0
 
 
 # --- codes
 
 
-def test_an_enumeration_in_a_float_is_sent_by_its_value_table_or_as_nan() -> None:
+def test_enumeration_in_a_float_is_sent_by_its_value_table_or_as_nan() -> None:
     state = Sig("OperatingState", 0, 32, texts={5: "Forward"})
     assert float_of(state) == 5.0
     other = LIVE._replace(operating_state=1)
@@ -146,7 +146,7 @@ def test_an_enumeration_in_a_float_is_sent_by_its_value_table_or_as_nan() -> Non
 @pytest.mark.parametrize(
     ("maximum", "is_sent"), [("1", False), ("44.4", False), ("44.5", True), ("0", True)]
 )
-def test_a_float_beyond_its_limits_is_nan(maximum: str, is_sent: bool) -> None:
+def test_float_beyond_its_limits_is_nan(maximum: str, is_sent: bool) -> None:
     number = float_of(Sig("BatteryVoltage", 0, 32, unit="V", maximum=maximum))
     if is_sent:
         assert number == pytest.approx(44.42)
@@ -158,20 +158,20 @@ def test_a_float_beyond_its_limits_is_nan(maximum: str, is_sent: bool) -> None:
 @pytest.mark.parametrize(
     "text", ["NotAvailable", "SNA", "sna", "N_A", "SignalNotAvailable", "not_available"]
 )
-def test_the_code_for_not_available_is_found_by_its_usual_names(text: str) -> None:
+def test_code_for_not_available_is_found_by_its_usual_names(text: str) -> None:
     signal = Sig("MaxBatteryVoltage", 0, 8, texts={9: text})  # an info value, not yet received
     assert raw_of(signal) == 9
 
 
 @pytest.mark.promise("codes")
 @pytest.mark.parametrize("text", ["Error", "ERR", "Invalid"])
-def test_the_code_for_an_error_is_found_by_its_usual_names(text: str) -> None:
+def test_code_for_an_error_is_found_by_its_usual_names(text: str) -> None:
     signal = Sig("BatteryVoltage", 0, 8, unit="mV", texts={9: text})
     assert raw_of(signal) == 9
 
 
 @pytest.mark.parametrize(("first_code", "sent"), [(7, [6, 0, 1]), (2, [0, 1, 0])])
-def test_a_counter_restarts_at_0_before_the_first_code(first_code: int, sent: list[int]) -> None:
+def test_counter_restarts_at_0_before_the_first_code(first_code: int, sent: list[int]) -> None:
     signal = Sig("LiveFrames", 0, 8, texts={first_code: "Error"})
     layout = layout_of([Msg("M", 0x100, 1, [signal])])
     read: list[int] = []
@@ -184,21 +184,21 @@ def test_a_counter_restarts_at_0_before_the_first_code(first_code: int, sent: li
 
 
 @pytest.mark.promise("e2e")
-def test_an_alive_counter_restarts_at_0_before_the_first_code() -> None:
+def test_alive_counter_restarts_at_0_before_the_first_code() -> None:
     signal = Sig("MessageCounter", 0, 4, texts={14: "Error", 5: "NotAvailable"})
     (plan,) = layout_of([Msg("M", 0x100, 1, [signal])]).messages
     assert plan.signals[0].high == 4
 
 
 @pytest.mark.parametrize("texts", [{100: "Invalid", 101: "Error"}, {9: "SNA", 8: "SNA"}])
-def test_a_further_code_between_the_values_is_refused(texts: dict[int, str]) -> None:
+def test_further_code_between_the_values_is_refused(texts: dict[int, str]) -> None:
     signal = Sig("PwmInput", 0, 16, texts=texts)
     (line,) = refused(dbc_text([Msg("M", 0x100, 8, [signal])]))
     assert "further code" in line
 
 
 @pytest.mark.promise("codes")
-def test_a_further_code_at_the_end_of_the_range_is_no_value() -> None:
+def test_further_code_at_the_end_of_the_range_is_no_value() -> None:
     texts = {65535: "SNA", 65534: "Error", 65533: "Invalid"}
     (plan,) = layout_of([Msg("M", 0x100, 8, [Sig("PwmInput", 0, 16, texts=texts)])]).messages
     assert plan.signals[0].high == 65532

@@ -64,7 +64,7 @@ def nested(depth: int, width: int) -> str:
         (" " * MAX_BYTES, "is larger than 8 MB"),
     ],
 )
-def test_a_file_out_of_bounds_is_refused_in_one_line_without_cantools(
+def test_file_out_of_bounds_is_refused_in_one_line_without_cantools(
     text: str,
     said: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -81,7 +81,7 @@ def test_a_file_out_of_bounds_is_refused_in_one_line_without_cantools(
     assert len(line) < 200
 
 
-def test_a_file_without_end_is_read_up_to_the_limit() -> None:
+def test_file_without_end_is_read_up_to_the_limit() -> None:
     with pytest.raises(UserError, match="is empty"):
         parse_database(b" " * MAX_BYTES, "my.dbc")
     with pytest.raises(UserError, match="larger than 8 MB"):

@@ -187,7 +187,7 @@ def check_signal(
 
 
 @pytest.mark.parametrize("file", [f for f in FILES if f.stem in SAMPLE], ids=lambda file: file.stem)
-def test_a_real_dbc_is_sent_or_refused_with_reasons(file: Path) -> None:
+def test_real_dbc_is_sent_or_refused_with_reasons(file: Path) -> None:
     check_file(file)
 
 

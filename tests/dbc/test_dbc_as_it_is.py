@@ -100,7 +100,7 @@ def test_comments_and_value_texts_are_not_touched() -> None:
     assert message.comment == comment
 
 
-def test_an_attribute_with_a_text_that_its_enumeration_lacks_is_refused() -> None:
+def test_attribute_with_a_text_that_its_enumeration_lacks_is_refused() -> None:
     text = (
         'BA_DEF_ BO_ "GenMsgSendType" ENUM "Cyclic";\nBA_ "GenMsgSendType" BO_ 256 "Sometimes";\n'
     )
@@ -119,7 +119,7 @@ def test_an_attribute_with_a_text_that_its_enumeration_lacks_is_refused() -> Non
         ('BA_DEF_DEF_ "Colour" 1;', 'BA_DEF_DEF_ "Colour"'),
     ],
 )
-def test_an_entry_for_a_missing_object_is_ignored_with_a_warning(entry: str, words: str) -> None:
+def test_entry_for_a_missing_object_is_ignored_with_a_warning(entry: str, words: str) -> None:
     warnings: list[str] = []
     comment = entry.replace('"', "")
     text = f'{STATE}CM_ SG_ 256 OperatingState "{comment}";\n{entry}\n'
@@ -141,7 +141,7 @@ for _unit, _rows in UNITS.items():
 
 @pytest.mark.promise("units")
 @pytest.mark.parametrize(("unit", "texts", "factor", "shift"), SPELLED)
-def test_a_unit_is_recognised_in_each_of_its_spellings(
+def test_unit_is_recognised_in_each_of_its_spellings(
     unit: str,
     texts: str,
     factor: str,
@@ -155,7 +155,7 @@ def test_a_unit_is_recognised_in_each_of_its_spellings(
 
 
 @pytest.mark.promise("units")
-def test_a_unit_of_another_quantity_or_of_two_meanings_is_refused() -> None:
+def test_unit_of_another_quantity_or_of_two_meanings_is_refused() -> None:
     """The lines of refusal, with the units that are possible, are in the golden set."""
     others = {
         "V": "MV A 1 x Unit_ deg m/s ° Nm",
@@ -212,7 +212,7 @@ ECU = (
 GATEWAYS: dict[str, Any] = {"node": "Gateway", "unbound": "start_value"}
 
 
-def test_a_pattern_without_a_message_of_this_gateway_is_refused() -> None:
+def test_pattern_without_a_message_of_this_gateway_is_refused() -> None:
     lines = refused(ECU, messages=["Motr_11", "Motor_11", "Motor_9*", "qqq*"], **GATEWAYS)
     words = "matches no message of Gateway in my_car.dbc."
     assert lines == [
@@ -230,7 +230,7 @@ def test_only_selected_messages_are_checked_and_others_cause_advice() -> None:
     assert "Motor_11.Motor_11X: no such source" in line
 
 
-def test_an_unbound_signal_has_its_start_value_as_cantools_reads_it() -> None:
+def test_unbound_signal_has_its_start_value_as_cantools_reads_it() -> None:
     layout = compiled(ECU, messages=["Motor_2?"], bind={"Gear": 5}, **GATEWAYS)
     gateway = gateway_with(layout, LiveData(battery_voltage=4442))
     database = parse_database(ECU.encode(), "my.dbc")
@@ -249,7 +249,7 @@ def test_an_unbound_signal_has_its_start_value_as_cantools_reads_it() -> None:
     assert once.endswith(": Motor_21")
 
 
-def test_a_start_value_may_be_any_number_that_fits_into_the_signal() -> None:
+def test_start_value_may_be_any_number_that_fits_into_the_signal() -> None:
     text = MESSAGE + signal("Foo", "7|12@0-") + START
     (theirs,) = parse_database(text.encode(), "my.dbc").messages
     for value in (-2048, 2047):
@@ -288,7 +288,7 @@ def all_sent(text: str, cycle: int = 20) -> str:
 
 
 @pytest.mark.parametrize("meant", SPELLINGS)
-def test_a_send_type_is_recognised_by_each_of_its_usual_names(meant: str) -> None:
+def test_send_type_is_recognised_by_each_of_its_usual_names(meant: str) -> None:
     for text in SPELLINGS[meant].split():
         (plan,) = compiled(all_sent(text)).messages
         assert plan.send_type == (SEND_TYPES[meant] if meant else SendType.CYCLIC), text
@@ -297,7 +297,7 @@ def test_a_send_type_is_recognised_by_each_of_its_usual_names(meant: str) -> Non
 
 
 @pytest.mark.parametrize("text", ["No", "Wrong", "OnRequest", "cyclically"])
-def test_an_unknown_send_type_is_refused_unless_dbc_send_type_defines_it(text: str) -> None:
+def test_unknown_send_type_is_refused_unless_dbc_send_type_defines_it(text: str) -> None:
     (line,) = refused(all_sent(text))
     assert f"unknown GenMsgSendType {text!r}" in line
     assert f"dbc.send_type.{text!r}" in line
@@ -329,7 +329,7 @@ def test_alive_counters_and_checksums_are_recognised_by_their_names() -> None:
         )
 
 
-def test_a_counter_is_sent_and_a_doubtful_counter_is_refused_unless_bound() -> None:
+def test_counter_is_sent_and_a_doubtful_counter_is_refused_unless_bound() -> None:
     text = MESSAGE + signal("COUNTER")
     other = MESSAGE + signal("ErrorCounter")
     (line,) = refused(other)
@@ -344,7 +344,7 @@ def test_a_counter_is_sent_and_a_doubtful_counter_is_refused_unless_bound() -> N
 
 
 @pytest.mark.parametrize("counter", ["COUNTER", "Nothing"])
-def test_a_checksum_is_refused_until_the_configuration_defines_it(
+def test_checksum_is_refused_until_the_configuration_defines_it(
     counter: str,
 ) -> None:
     text = MESSAGE + signal("CHKSM") + signal(counter, "8|4@1+")
@@ -425,7 +425,7 @@ def test_without_telemetry_a_flag_is_0_or_its_configured_value(
         assert packed(plan, gateway)[0] == value
 
 
-def test_a_bit_that_cannot_hold_both_values_of_a_flag_is_refused() -> None:
+def test_bit_that_cannot_hold_both_values_of_a_flag_is_refused() -> None:
     (line,) = refused(FLAG.replace("@1+", "@1-"))
     assert "both values of a flag" in line
     assert "unsigned" in line
@@ -459,7 +459,7 @@ STATES = signal("OperatingState", "8|8@1+") + 'VAL_ 256 OperatingState 7 "MotorO
         (STATES + START + start_of("OperatingState", 7), None),
     ],
 )
-def test_a_layout_without_a_signal_that_reports_the_loss_causes_a_warning(
+def test_layout_without_a_signal_that_reports_the_loss_causes_a_warning(
     beside: str, name: str | None
 ) -> None:
     layout = compiled(FLAG + beside)
@@ -482,13 +482,13 @@ def test_each_flag_needs_a_signal_of_its_own_esc_to_report_the_loss() -> None:
     assert "LeftUndervoltage" not in line
 
 
-def test_a_float_of_24_bits_is_refused_even_with_a_start_value() -> None:
+def test_float_of_24_bits_is_refused_even_with_a_start_value() -> None:
     float_24 = signal("Throttle", "0|24@1-", "%") + "SIG_VALTYPE_ 256 Throttle : 1;\n"
     (line,) = refused(MESSAGE + float_24 + START + start_of("Throttle", 5))
     assert "a float of 24 bits is not supported" in line
 
 
-def test_a_capture_stores_the_dbc_settings_and_0_5_0_stored_fewer() -> None:
+def test_capture_stores_the_dbc_settings_and_0_5_0_stored_fewer() -> None:
     old = DbcConfig(bind={"A.B": 1}, base_id=5, e2e_data_ids={"M": 7}, on_loss="silent")
     later: dict[str, Any] = {
         "units": {"x": "V"},
@@ -510,14 +510,14 @@ def test_a_capture_stores_the_dbc_settings_and_0_5_0_stored_fewer() -> None:
 @pytest.mark.parametrize(
     "line", ["BS_: 250000 : 0,0", "BS_ : 500000 : 1 , 28 ;", "\tBS_:125000:0,0", "BS_:"]
 )
-def test_a_bus_with_a_baud_rate_is_read(line: str) -> None:
+def test_bus_with_a_baud_rate_is_read(line: str) -> None:
     text = f'VERSION ""\nNS_ :\n{line}\nBU_: GW\nBO_ 673 ESC_1: 8 GW\n' + signal("BatteryVoltage")
     (message,) = compiled(text).messages
     assert message.name == "ESC_1"
     assert message.can_id == 673
 
 
-def test_a_comment_that_looks_like_a_baud_rate_is_kept() -> None:
+def test_comment_that_looks_like_a_baud_rate_is_kept() -> None:
     comment = "seen:\nBS_: 250000 : 0,0\nSG_ X : 0|16@3+"
     (message,) = parse_database(f'{STATE}CM_ BO_ 256 "{comment}";\n'.encode(), "my.dbc").messages
     assert message.comment == comment
@@ -532,9 +532,7 @@ def test_a_comment_that_looks_like_a_baud_rate_is_kept() -> None:
         ("01", "01"),
     ],
 )
-def test_an_unknown_byte_order_is_refused_with_the_name_of_the_signal(
-    order: str, said: str
-) -> None:
+def test_unknown_byte_order_is_refused_with_the_name_of_the_signal(order: str, said: str) -> None:
     (line,) = refused(STATE.replace("@1", f"@{order}"))
     assert line == (
         f"{FILE}: Power.OperatingState: byte order {said} is neither 0 (Motorola) nor 1 (Intel). "
@@ -569,7 +567,7 @@ def test_messages_without_a_transmitter_need_a_selection_and_a_match() -> None:
     assert "ESC_" in line[-30:]
 
 
-def test_a_message_with_a_transmitter_is_not_selected_by_name_alone() -> None:
+def test_message_with_a_transmitter_is_not_selected_by_name_alone() -> None:
     text = HEAD + UNSENT + "BO_ 700 Theirs: 8 Other\n" + signal("BatteryVoltage")
     (line,) = refused(text, messages=("ESC_1",))
     assert "ESC_1 has no transmitter" in line
@@ -580,7 +578,7 @@ def test_a_message_with_a_transmitter_is_not_selected_by_name_alone() -> None:
     ("written", "used_ns"),
     [("12.5", 12_500_000), ("0.25", MS), ("33.333", 33_333_000), ("10", 10 * MS)],
 )
-def test_a_cycle_time_with_a_fraction_is_exact_or_causes_a_warning(
+def test_cycle_time_with_a_fraction_is_exact_or_causes_a_warning(
     kind: str,
     written: str,
     used_ns: int,
@@ -597,7 +595,7 @@ def test_a_cycle_time_with_a_fraction_is_exact_or_causes_a_warning(
     assert [line for line in layout.warnings if "CycleTime" in line] == said * (written == "0.25")
 
 
-def test_a_minimum_distance_with_a_fraction_is_exact() -> None:
+def test_minimum_distance_with_a_fraction_is_exact() -> None:
     text = 'BA_DEF_ BO_ "GenMsgDelayTime" INT 0 9;\nBA_DEF_DEF_ "GenMsgDelayTime" 7.5;\n'
     assert compiled(STATE + text).messages[0].delay_ns == 7_500_000
 
@@ -627,7 +625,7 @@ def test_frames_with_a_cycle_of_a_fraction_keep_it_on_average() -> None:
     ],
 )
 @pytest.mark.parametrize("sender", ["Other", "Gateway"])
-def test_an_impossible_message_is_left_out_unless_the_gateway_sends_it(
+def test_impossible_message_is_left_out_unless_the_gateway_sends_it(
     number: int, place: str, words: str, sender: str
 ) -> None:
     text = f'{STATE}BO_ {number} Theirs: 8 {sender}\n{signal("A", place)}VAL_ {number} A 1 "x" ;\n'
@@ -666,7 +664,7 @@ def test_equal_names_and_ids_are_warnings_with_the_file_and_not_of_the_library(
         ("1,0", ()),
     ],
 )
-def test_a_factor_finer_than_the_value_is_noted(factor: str, notes: tuple[str, ...]) -> None:
+def test_factor_finer_than_the_value_is_noted(factor: str, notes: tuple[str, ...]) -> None:
     text = MESSAGE + signal("BatteryCurrent", "0|16@1-", "A", factor, "-100|100")
     (plan,) = compiled(text).messages
     (only,) = plan.signals
@@ -687,7 +685,7 @@ def test_a_factor_finer_than_the_value_is_noted(factor: str, notes: tuple[str, .
         ),
     ],
 )
-def test_a_database_of_another_format_is_named_with_its_converter(
+def test_database_of_another_format_is_named_with_its_converter(
     name: str, beginning: str, said: str
 ) -> None:
     with pytest.raises(UserError, match=re.escape(said)):

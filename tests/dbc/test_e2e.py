@@ -68,7 +68,7 @@ def protection(name: str, *data_ids: int) -> Protection:
         ),
     ],
 )
-def test_the_examples_of_the_specification_are_reproduced(
+def test_examples_of_the_specification_are_reproduced(
     protected: Protection, at: int, frames: Sequence[str]
 ) -> None:
     for text in frames:
@@ -79,7 +79,7 @@ def test_the_examples_of_the_specification_are_reproduced(
 
 @given(st.binary(min_size=3, max_size=64), st.integers(0, 0xFFFF), st.data())
 @pytest.mark.parametrize("name", SINGLE_ID)
-def test_a_crc_equals_the_one_of_the_autosar_package_at_every_place(
+def test_crc_equals_the_one_of_the_autosar_package_at_every_place(
     name: str, data: bytes, data_id: int, draw: st.DataObject
 ) -> None:
     profile = PROFILES[name]
@@ -99,7 +99,7 @@ def test_a_crc_equals_the_one_of_the_autosar_package_at_every_place(
 
 @given(st.binary(min_size=2, max_size=64), st.binary(min_size=16, max_size=16))
 @pytest.mark.parametrize("name", ["2", "22"])
-def test_a_crc_with_a_list_of_data_ids_equals_the_one_of_both_packages(
+def test_crc_with_a_list_of_data_ids_equals_the_one_of_both_packages(
     name: str, data: bytes, data_ids: bytes
 ) -> None:
     expected = bytearray(data)
@@ -192,9 +192,7 @@ def test_counters_and_crcs_of_100_000_frames_are_right(core_language: str) -> No
 
 @pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
 @pytest.mark.parametrize("name", ["2", "5", "11C", "22"])
-def test_a_busy_bus_loses_frames_but_never_changes_their_order(
-    core_language: str, name: str
-) -> None:
+def test_busy_bus_loses_frames_but_never_changes_their_order(core_language: str, name: str) -> None:
     chance = random.Random(name + core_language)
     sender = Sender(layout_of(name))
     queue = TransmitQueue()
@@ -241,7 +239,7 @@ def test_frames_of_a_multiplexed_message_share_one_counter() -> None:
         assert is_right("2", frame.data)
 
 
-def test_the_counter_of_a_multiplexed_message_never_runs_backward_on_a_busy_bus() -> None:
+def test_counter_of_a_multiplexed_message_never_runs_backward_on_a_busy_bus() -> None:
     chance = random.Random(0)
     sender = Sender(multiplexed())
     queue = TransmitQueue()
@@ -275,7 +273,7 @@ def profiles_of(layout: MessageLayout) -> list[str]:
     return [getattr(plan.e2e, "profile", NO_PROFILE).name for plan in layout.messages]
 
 
-def test_a_profile_is_named_by_message_or_pattern_and_an_exact_name_wins() -> None:
+def test_profile_is_named_by_message_or_pattern_and_an_exact_name_wins() -> None:
     ids = {"Motor_1": FIRST_16, "Motor_2": 7, "Other": FIRST_16}
     e2e = {"Motor_*": "2", "Motor_2": "11A", "O*": "22"}
     layout = compiled(dbc_text(MESSAGES), e2e=e2e, e2e_data_ids=ids)
@@ -286,7 +284,7 @@ def test_a_profile_is_named_by_message_or_pattern_and_an_exact_name_wins() -> No
     assert not [line for line in layout.warnings if "E2E" in line]
 
 
-def test_a_data_id_alone_means_profile_1_and_a_pattern_needs_no_data_id_for_it() -> None:
+def test_data_id_alone_means_profile_1_and_a_pattern_needs_no_data_id_for_it() -> None:
     layout = compiled(
         dbc_text(MESSAGES), e2e={"O*": "1A"}, e2e_data_ids=dict.fromkeys(("Motor_1", "Motor_2"), 5)
     )
@@ -306,7 +304,7 @@ def test_a_data_id_alone_means_profile_1_and_a_pattern_needs_no_data_id_for_it()
         ("1B", None, "needs one data ID; it has none"),
     ],
 )
-def test_a_missing_or_unfit_data_id_is_refused(
+def test_missing_or_unfit_data_id_is_refused(
     name: str, data_ids: int | tuple[int, ...] | None, text: str
 ) -> None:
     ids = {} if data_ids is None else {"M": data_ids}
@@ -355,7 +353,7 @@ def layout_text(name: str, **changes: Sig | None) -> str:
         ("11C", {"nibble": Sig("M_DataIDNibble", 16, 8)}, "has to be 4 bits of every frame"),
     ],
 )
-def test_a_message_whose_signals_do_not_fit_the_profile_is_refused(
+def test_message_whose_signals_do_not_fit_the_profile_is_refused(
     name: str, changes: dict[str, Sig | None], text: str
 ) -> None:
     settings: dict[str, Any] = {"e2e": {"M": name}, "e2e_data_ids": {"M": DATA_IDS[name]}}
@@ -376,7 +374,7 @@ def test_profile_22_may_be_anywhere_and_the_nibble_is_bound_by_any_name() -> Non
     assert signal.constant == 5
 
 
-def test_a_profile_of_no_protected_message_is_refused_with_the_nearest_name() -> None:
+def test_profile_of_no_protected_message_is_refused_with_the_nearest_name() -> None:
     text = dbc_text([*MESSAGES, Msg("Plain", 0x200, 8, [Sig("BatteryVoltage", 0, 16, unit="V")])])
     ids = dict.fromkeys(("Motor_1", "Motor_2", "Other"), 1)
     lines = refused(text, e2e={"Plain": "1A", "Othr": "5"}, e2e_data_ids=ids)
@@ -384,14 +382,14 @@ def test_a_profile_of_no_protected_message_is_refused_with_the_nearest_name() ->
     assert "Did you mean Other?" in lines[0]
 
 
-def test_a_checksum_of_an_unstated_kind_is_refused_and_names_the_keys() -> None:
+def test_checksum_of_an_unstated_kind_is_refused_and_names_the_keys() -> None:
     lines = refused(dbc_text(MESSAGES))
     assert len(lines) == 3
     assert 'dbc.e2e.Motor_1 = "2"' in lines[0]
     assert "dbc.e2e_data_ids.Motor_1 = 0x100" in lines[0]
 
 
-def test_a_capture_keeps_profiles_and_data_ids() -> None:
+def test_capture_keeps_profiles_and_data_ids() -> None:
     settings = DbcConfig(e2e={"M": "2"}, e2e_data_ids={"M": IDS_OF_2})
     setup = CaptureSetup((EscSettings(),), ("-",), ("my.dbc", b""), settings, False)
     header = json.loads(json.dumps(setup.header()))
@@ -413,7 +411,7 @@ def test_a_capture_keeps_profiles_and_data_ids() -> None:
     ],
 )
 @pytest.mark.parametrize("owner", ["BO_ 291", "SG_ 291 M_CRC"])
-def test_a_capture_replays_with_the_data_id_that_was_sent(
+def test_capture_replays_with_the_data_id_that_was_sent(
     name: str,
     profile: str | None,
     data_id: int,
@@ -485,7 +483,7 @@ LIST = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0xB, 0x0C, 13, 14, 15, 16"
     ],
 )
 @pytest.mark.parametrize("owner", ["BO_ 291", "SG_ 291 M_CRC"])
-def test_a_profile_is_recognised_by_the_attributes_of_oems(
+def test_profile_is_recognised_by_the_attributes_of_oems(
     spelling: str, name: str, owner: str
 ) -> None:
     data_id: object = LIST if name in ("2", "22") else 0x123
@@ -498,7 +496,7 @@ def test_a_profile_is_recognised_by_the_attributes_of_oems(
 
 
 @pytest.mark.parametrize("text", [f"[{LIST}]", LIST.replace(",", ";"), LIST.replace(",", "")])
-def test_a_list_of_data_ids_is_read_in_its_usual_forms(text: str) -> None:
+def test_list_of_data_ids_is_read_in_its_usual_forms(text: str) -> None:
     named = attributes("P02", text).replace("E2EDataId", "DataIds")
     (plan,) = compiled(layout_text("2") + named).messages
     assert plan.e2e is not None
@@ -516,12 +514,12 @@ def test_a_list_of_data_ids_is_read_in_its_usual_forms(text: str) -> None:
         ("P05", None, "needs one data ID; it has none"),
     ],
 )
-def test_an_unclear_attribute_is_refused(profile: str, data_id: object, text: str) -> None:
+def test_unclear_attribute_is_refused(profile: str, data_id: object, text: str) -> None:
     lines = refused(layout_text("2") + attributes(profile, data_id))
     assert any(text in line for line in lines), lines
 
 
-def test_the_configuration_has_priority_over_the_attributes() -> None:
+def test_configuration_has_priority_over_the_attributes() -> None:
     text = layout_text("2") + attributes("P04", 5)
     layout = compiled(text, e2e={"M": "2"}, e2e_data_ids={"M": FIRST_16})
     assert profiles_of(layout) == ["2"]
@@ -530,7 +528,7 @@ def test_the_configuration_has_priority_over_the_attributes() -> None:
     assert plan.e2e == protection("2", *IDS_OF_2)
 
 
-def test_a_default_profile_needs_a_data_id_of_the_message() -> None:
+def test_default_profile_needs_a_data_id_of_the_message() -> None:
     text = layout_text("2").replace("M_CRC", "M_Check").replace("M_BZ", "M_Number")
     bind: dict[str, str | float] = {"M_Check": "crc", "M_Number": "alive"}
     default = attributes(None, LIST).replace('"none"', '"P02"')
@@ -550,7 +548,7 @@ def test_only_a_message_that_is_protected_as_a_whole_is_sent(bits: int) -> None:
     assert "is 56 bits of 64" in line
 
 
-def test_a_protected_message_without_a_known_crc_is_refused_unless_it_is_a_constant() -> None:
+def test_protected_message_without_a_known_crc_is_refused_unless_it_is_a_constant() -> None:
     text = layout_text("2").replace("M_CRC", "M_Check") + attributes("P02", LIST)
     lines = refused(text, unbound="start_value")
     assert any('dbc.bind.SIGNAL = "crc"' in line for line in lines)
@@ -558,7 +556,7 @@ def test_a_protected_message_without_a_known_crc_is_refused_unless_it_is_a_const
     assert profiles_of(compiled(text, bind={"M_Check": 0})) == [""]
 
 
-def test_a_data_id_of_the_dbc_is_not_used_for_copies_for_several_escs() -> None:
+def test_data_id_of_the_dbc_is_not_used_for_copies_for_several_escs() -> None:
     text = layout_text("5", value=Sig("BatteryVoltage", 32, 16, unit="V"))
     text += attributes("P05", 0x123)
     lines = refused(text, ("left", "right"))
@@ -579,7 +577,7 @@ def test_a_data_id_of_the_dbc_is_not_used_for_copies_for_several_escs() -> None:
         ("2", LIST, (IDS_OF_2, FIRST_16)),
     ],
 )
-def test_a_dbc_for_several_escs_states_the_data_ids_that_are_sent(
+def test_dbc_for_several_escs_states_the_data_ids_that_are_sent(
     name: str,
     stated: object,
     ids: tuple[Any, Any],
@@ -630,7 +628,7 @@ def e2e_warnings(layout: MessageLayout) -> list[str]:
 
 
 @pytest.mark.parametrize("name", ["DataID", "DataId", "E2EId", "E2EDataIdentifier"])
-def test_a_data_id_with_an_unusual_name_is_used_with_a_warning(name: str) -> None:
+def test_data_id_with_an_unusual_name_is_used_with_a_warning(name: str) -> None:
     text = layout_text("1A") + attributes("P01", 7).replace("E2EDataId", name)
     layout = compiled(text)
     assert [plan.e2e for plan in layout.messages] == [protection("1A", 7)]
@@ -641,7 +639,7 @@ def test_a_data_id_with_an_unusual_name_is_used_with_a_warning(name: str) -> Non
 
 
 @pytest.mark.parametrize("value", ["x", "70000", "1, 2"])
-def test_an_unusual_name_with_an_unfit_data_id_changes_no_frame(value: str) -> None:
+def test_unusual_name_with_an_unfit_data_id_changes_no_frame(value: str) -> None:
     text = layout_text("1A") + attributes("P01", value).replace("E2EDataId", "DataID")
     layout = compiled(text)
     assert [plan.e2e for plan in layout.messages] == [protection("1A", 0x123)]
@@ -663,7 +661,7 @@ def test_copies_with_profile_1a_report_the_data_id_that_they_do_not_use() -> Non
     assert not e2e_warnings(compiled(text, ("left", "right"), e2e_data_ids=confirmed))
 
 
-def test_an_assumed_profile_uses_the_data_id_of_the_dbc() -> None:
+def test_assumed_profile_uses_the_data_id_of_the_dbc() -> None:
     text = layout_text("1A").replace("M_BZ", "M_Alive") + attributes(None, 7)
     layout = compiled(text)
     assert [plan.e2e for plan in layout.messages] == [protection("1A", 7)]
@@ -689,7 +687,7 @@ def test_equal_data_ids_of_several_messages_cause_one_warning() -> None:
         ("5", 64, None),
     ],
 )
-def test_a_message_beyond_the_length_of_its_profile_causes_a_warning(
+def test_message_beyond_the_length_of_its_profile_causes_a_warning(
     name: str, length: int, most: int | None
 ) -> None:
     text = layout_text(name).replace("BO_ 291 M: 8", f"BO_ 291 M: {length}")
@@ -699,25 +697,25 @@ def test_a_message_beyond_the_length_of_its_profile_causes_a_warning(
         assert f"has {length} bytes, but AUTOSAR allows at most {most} for E2E profile" in line
 
 
-def test_a_profile_that_is_stated_as_none_is_named_in_the_warning() -> None:
+def test_profile_that_is_stated_as_none_is_named_in_the_warning() -> None:
     text = layout_text("1A").replace("M_BZ", "M_Alive") + attributes("none", None)
     (line,) = e2e_warnings(compiled(text))
     assert "sent as AUTOSAR E2E profile 1, although its E2EProfile is 'none'" in line
 
 
-def test_an_assumed_profile_and_a_data_id_of_an_unusual_name_cause_one_warning() -> None:
+def test_assumed_profile_and_a_data_id_of_an_unusual_name_cause_one_warning() -> None:
     text = layout_text("1A").replace("M_BZ", "M_Alive") + attributes("none", 7)
     (line,) = e2e_warnings(compiled(text.replace("E2EDataId", "DataID")))
     assert line.endswith("To confirm this, set dbc.e2e_data_ids.M = 0x7")
 
 
 @pytest.mark.parametrize("name", ["1B", "1C", "2", "5"])
-def test_a_message_that_lacks_only_its_data_id_gets_one_line(name: str) -> None:
+def test_message_that_lacks_only_its_data_id_gets_one_line(name: str) -> None:
     (line,) = refused(layout_text(name), e2e={"M": name})
     assert "it has none. Set dbc.e2e_data_ids.M" in line
 
 
-def test_a_nibble_without_a_profile_names_the_profile_as_remedy() -> None:
+def test_nibble_without_a_profile_names_the_profile_as_remedy() -> None:
     lines = refused(layout_text("1C"))
     (line,) = [line for line in lines if "M_DataIDNibble" in line]
     assert 'dbc.e2e.M = "1C"' in line
@@ -734,7 +732,7 @@ def test_a_nibble_without_a_profile_names_the_profile_as_remedy() -> None:
         ("x_AliveCnt1", "alive"),
     ],
 )
-def test_a_name_like_a_checksum_or_counter_gets_the_binding_as_hint(name: str, role: str) -> None:
+def test_name_like_a_checksum_or_counter_gets_the_binding_as_hint(name: str, role: str) -> None:
     (line,) = refused(dbc_text([Msg("M", 0x123, 8, [Sig(name, 0, 8)])]))
     assert line.endswith(f'bind it: dbc.bind.{name} = "{role}".')
     assert "Did you mean" not in line

@@ -104,11 +104,11 @@ def relations(text: str) -> list[str]:
 # --- nothing is lost
 
 
-def test_the_shipped_file_for_one_esc_is_written_byte_for_byte() -> None:
+def test_shipped_file_for_one_esc_is_written_byte_for_byte() -> None:
     assert writer.copies_text(parse_database(SHIPPED.encode(), "x")) == SHIPPED
 
 
-def test_a_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
+def test_rich_dbc_is_written_for_two_escs_without_a_loss() -> None:
     before = read(RICH)
     after, text = multiplied(RICH, PAIR, "Gw")
     assert facts_of_database(after) == facts_of_database(before)
@@ -284,7 +284,7 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
         (RICH, "Gw"),
     ],
 )
-def test_the_written_file_compiles_to_the_plans_that_are_sent(text: str, node: str) -> None:
+def test_written_file_compiles_to_the_plans_that_are_sent(text: str, node: str) -> None:
     """Two of the ESCs are alike and share a plan. It equals the plan of each compiled alone."""
     three = [
         EscSettings("left", 7),

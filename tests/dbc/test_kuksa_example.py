@@ -88,7 +88,7 @@ def decoded(name: str, raw: int) -> Any:
     return message.decode(data)[name]
 
 
-def test_the_mapping_is_as_the_provider_requires() -> None:
+def test_mapping_is_as_the_provider_requires() -> None:
     schema = json.loads(SCHEMA.read_text())
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.Draft202012Validator(schema).validate(MAPPING)
@@ -114,7 +114,7 @@ def nodes(children: Any = MAPPING, prefix: str = "") -> Iterator[tuple[str, Any]
         yield from nodes(node.get("children", {}), f"{prefix}{name}.")
 
 
-def test_the_overlay_has_the_nodes_of_the_mapping() -> None:
+def test_overlay_has_the_nodes_of_the_mapping() -> None:
     yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
     assert yaml.safe_load(OVERLAY.read_text()) == dict(nodes())
 
@@ -148,7 +148,7 @@ def test_codes_for_not_available_are_not_passed_on_as_numbers(name: str) -> None
         ("Vehicle.Private.Esc.LinkState", 4, "LOST"),
     ],
 )
-def test_a_value_is_passed_on_in_the_unit_of_vss(name: str, raw: int, expected: object) -> None:
+def test_value_is_passed_on_in_the_unit_of_vss(name: str, raw: int, expected: object) -> None:
     node = SENSORS[name]
     found = transformed(node, decoded(node["dbc2vss"]["signal"], raw))
     assert found == (pytest.approx(expected) if isinstance(expected, float) else expected)

@@ -52,7 +52,7 @@ def test_ids_of_11_and_29_bits_may_be_equal_and_other_senders_do_not_matter() ->
     assert [message.extended for message in both] == [False, True]
 
 
-def test_a_start_value_that_is_not_a_number_is_ignored() -> None:
+def test_start_value_that_is_not_a_number_is_ignored() -> None:
     more = 'BA_ "GenSigStartValue" SG_ 256 BatteryVoltage 1;'
     text = dbc_text([Msg("Power", 0x100, 8, [VOLTAGE])], more)
     text = re.sub(r'(?m)^(BA_DEF_ SG_ "GenSigStartValue").*', r'\1 ENUM "a","b";', text)
@@ -142,7 +142,7 @@ def message_of(*names: str, length: int = 8, extended: bool = False) -> Msg:
         (64, True, FD, 36 + 9 + 13, 517 + 129 + 33),
     ],
 )
-def test_a_frame_is_counted_with_its_bits_and_the_most_stuff_bits(
+def test_frame_is_counted_with_its_bits_and_the_most_stuff_bits(
     length: int,
     extended: bool,
     frame_format: int,
@@ -173,7 +173,7 @@ def test_a_frame_is_counted_with_its_bits_and_the_most_stuff_bits(
         (("LeftBatteryVoltage",), ON_CHANGE, 0, 0, 0),
     ],
 )  # fmt: skip
-def test_a_message_is_counted_as_if_each_esc_sent_at_100_hz(
+def test_message_is_counted_as_if_each_esc_sent_at_100_hz(
     names: tuple[str, ...],
     kind: int,
     cycle: int,
@@ -196,7 +196,7 @@ def test_a_message_is_counted_as_if_each_esc_sent_at_100_hz(
         (("LeftBatteryVoltage",), CYCLIC, 10, 0, 100),
     ],
 )  # fmt: skip
-def test_the_worst_load_counts_each_change(
+def test_worst_load_counts_each_change(
     names: tuple[str, ...],
     kind: int,
     cycle: int,
@@ -209,7 +209,7 @@ def test_the_worst_load_counts_each_change(
 
 
 @pytest.mark.promise("overload")
-def test_the_worst_load_causes_a_warning_and_the_usual_load_a_refusal() -> None:
+def test_worst_load_causes_a_warning_and_the_usual_load_a_refusal() -> None:
     message = message_of("LeftBatteryVoltage")
     layout = layout_of(message, CYCLIC_AND_ON_CHANGE, 20)
     assert check_load(layout, 50 * 3 * 135 * 2) is None
@@ -226,7 +226,7 @@ def test_the_worst_load_causes_a_warning_and_the_usual_load_a_refusal() -> None:
     assert "need 10% of 10 kbit/s, and up to 60% while" in str(loaded)
 
 
-def test_the_bits_of_canopen_nodes_are_counted_too() -> None:
+def test_bits_of_canopen_nodes_are_counted_too() -> None:
     layout = layout_of(message_of("LeftBatteryVoltage"))
     assert check_load(layout, 36_000, further={"the CANopen nodes": 4_500}) is None
     warning = str(check_load(layout, 36_000, further={"the CANopen nodes": 8_100}))

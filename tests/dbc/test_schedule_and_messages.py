@@ -330,7 +330,7 @@ def test_phases_lie_within_the_cycle_and_evenly_apart(cycles: list[int]) -> None
 # --- event
 
 
-def test_an_event_message_with_link_values_is_sent_with_each_live_frame() -> None:
+def test_event_message_with_link_values_is_sent_with_each_live_frame() -> None:
     bench = lone(EVENT, 0, 0, Sig("LinkState", 16, 8))
     lives = 0
     for _ in range(250):
@@ -396,7 +396,7 @@ def test_silent_sends_a_message_of_several_escs_while_one_is_up() -> None:
 
 
 @pytest.mark.promise("one-frame-one-time")
-def test_a_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
+def test_frame_of_one_esc_never_carries_an_old_value_of_another() -> None:
     signals = [
         replace(VOLTAGE, name="LeftBatteryVoltage"),
         replace(VOLTAGE, name="RightBatteryVoltage", start=16),
@@ -492,7 +492,7 @@ def test_only_the_changed_page_is_sent_on_change() -> None:
     assert bench.raws(8) == [1, 5, 9, 9, 5]
 
 
-def test_a_cycle_sends_its_page_in_addition_to_a_changed_page_put_off() -> None:
+def test_cycle_sends_its_page_in_addition_to_a_changed_page_put_off() -> None:
     signals = [
         Sig("Page", 0, 8, mux="M"),
         Sig("BatteryVoltage", 8, 16, mux="m1", factor="0.01"),
@@ -526,7 +526,7 @@ def test_a_cycle_sends_its_page_in_addition_to_a_changed_page_put_off() -> None:
 
 
 @pytest.mark.parametrize("kind", [ON_CHANGE, EVENT, CYCLIC_AND_ON_CHANGE])
-def test_the_gateway_status_is_sent_when_it_changes(kind: int) -> None:
+def test_gateway_status_is_sent_when_it_changes(kind: int) -> None:
     names = ("GatewayState", "CanState", "EscsOk", "EscCount")
     signals = [Sig(name, 8 * place, 8) for place, name in enumerate(names)]
     message = Msg("Health", 0x100, 8, signals)

@@ -114,7 +114,7 @@ FIELDS = [
 
 
 @pytest.mark.parametrize("field", FIELDS, ids=lambda field: field.name)
-def test_a_signal_holds_every_step_of_its_field_in_the_sheet(field: specification.Field) -> None:
+def test_signal_holds_every_step_of_its_field_in_the_sheet(field: specification.Field) -> None:
     name = pascal(field.name) + ("Percent" if field.unit == "%" else "")
     found = next(signal for signal in signals_of(SHIPPED) if signal.name == name)
     step = Decimal(1) / field.steps

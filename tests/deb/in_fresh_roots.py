@@ -219,7 +219,7 @@ def test_every_command_works_in_a_fresh_root(packages: dict[str, Path], root: Ro
 
 
 @both_releases
-def test_the_package_can_be_installed_and_purged_without_systemd(
+def test_package_can_be_installed_and_purged_without_systemd(
     packages: dict[str, Path],
     root: Root,
 ) -> None:
@@ -289,7 +289,7 @@ def booted(
 
 
 @both_releases
-def test_the_package_replaces_0_5_0_runs_read_only_and_is_purged(
+def test_package_replaces_0_5_0_runs_read_only_and_is_purged(
     packages: dict[str, Path],
     root: Root,
     work: Path,
@@ -332,7 +332,7 @@ def test_the_package_replaces_0_5_0_runs_read_only_and_is_purged(
 
 
 @both_releases
-def test_a_running_gateway_is_restarted_by_an_upgrade_and_ended_by_removal(
+def test_running_gateway_is_restarted_by_an_upgrade_and_ended_by_removal(
     packages: dict[str, Path],
     root: Root,
     work: Path,
@@ -377,7 +377,7 @@ def newer(package: Path, folder: Path) -> Path:
     ("architecture", "release"),
     list(zip(EMULATORS, reversed(RELEASES), strict=True)),
 )
-def test_the_core_of_an_arm_package_runs_in_the_releases_python(
+def test_core_of_an_arm_package_runs_in_the_releases_python(
     packages: dict[str, Path],
     work: Path,
     architecture: str,

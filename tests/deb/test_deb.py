@@ -157,7 +157,7 @@ def test_no_file_is_in_etc_or_var_and_all_files_belong_to_root(made: dict[str, b
         assert member.mode & 0o777 == mode, name
 
 
-def test_the_package_has_units_rules_completion_and_manual(made: dict[str, bytes]) -> None:
+def test_package_has_units_rules_completion_and_manual(made: dict[str, bytes]) -> None:
     package = made["armhf"]
     found = contents(package)
     for kind in ("", "-mqtt", "-metrics"):
@@ -239,7 +239,7 @@ def installed(board: Path) -> list[Path]:
         ("prerm", "remove"),
     ],
 )
-def test_the_package_removes_files_of_service_install(board: Path, words: tuple[str, ...]) -> None:
+def test_package_removes_files_of_service_install(board: Path, words: tuple[str, ...]) -> None:
     """It also does so before another version's files replace the files to compare with."""
     installed(board)
     link = board / "etc/systemd/system/multi-user.target.wants/kontronik-can-gw@left.service"
@@ -263,7 +263,7 @@ def test_files_changed_by_hand_are_kept_and_reported(board: Path) -> None:
     assert all(path.exists() for path in files)
 
 
-def test_a_purge_keeps_network_files_and_another_installations_files(board: Path) -> None:
+def test_purge_keeps_network_files_and_another_installations_files(board: Path) -> None:
     kept = [board / "etc/kontronik-can-gw/gateway.toml", board / "var/lib/kontronik-can-gw/esc1"]
     network = board / "etc/systemd/network/50-kontronik-can-gw-can0.network"
     for path in (*kept, network):
@@ -376,7 +376,7 @@ def bill_of(package: bytes) -> dict[str, Any]:
     return found
 
 
-def test_the_bill_of_materials_is_valid_cyclonedx(made: dict[str, bytes]) -> None:
+def test_bill_of_materials_is_valid_cyclonedx(made: dict[str, bytes]) -> None:
     validation = pytest.importorskip("cyclonedx.validation.json")
     schema = pytest.importorskip("cyclonedx.schema")
     validator = validation.JsonStrictValidator(schema.SchemaVersion.V1_6)
@@ -384,7 +384,7 @@ def test_the_bill_of_materials_is_valid_cyclonedx(made: dict[str, bytes]) -> Non
         assert validator.validate_str(json.dumps(bill_of(package))) is None
 
 
-def test_the_bill_of_materials_lists_core_and_libraries(made: dict[str, bytes]) -> None:
+def test_bill_of_materials_lists_core_and_libraries(made: dict[str, bytes]) -> None:
     bill = bill_of(made["arm64"])
     own = bill["metadata"]["component"]
     assert (own["name"], own["version"]) == (make_deb.NAME, make_deb.version())
@@ -399,7 +399,7 @@ def test_the_bill_of_materials_lists_core_and_libraries(made: dict[str, bytes]) 
     assert set(depends[own["bom-ref"]]) == {each["bom-ref"] for each in bill["components"]}
 
 
-def test_the_bill_of_materials_is_beside_the_package_too(tmp_path: Path) -> None:
+def test_bill_of_materials_is_beside_the_package_too(tmp_path: Path) -> None:
     wheel, libraries = inputs(tmp_path)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
@@ -421,7 +421,7 @@ def test_the_bill_of_materials_is_beside_the_package_too(tmp_path: Path) -> None
         ("Summary: x", None),
     ],
 )
-def test_a_licence_is_taken_from_the_metadata_of_the_wheel(head: str, licence: object) -> None:
+def test_licence_is_taken_from_the_metadata_of_the_wheel(head: str, licence: object) -> None:
     assert licence_of(message_from_string(f"Name: x\nVersion: 1\n{head}\n\n")) == licence
 
 

@@ -229,7 +229,7 @@ def test_emergencies_are_the_bits_enabled_in_the_eds(facts: Facts) -> None:
     assert of_gateway == expected
 
 
-def test_a_counter_of_an_object_restarts_after_the_number_of_its_type(facts: Facts) -> None:
+def test_counter_of_an_object_restarts_after_the_number_of_its_type(facts: Facts) -> None:
     """The limit of the DBC's signal is lower, because the signal has codes and fewer bits."""
     rows = {row["object"]: row for row in facts["objects"]}
     for place in ("2001h:04", "2020h:07", "2021h:03"):
@@ -355,7 +355,7 @@ def paragraphs(text: str) -> list[str]:
 @given(st.lists(words, min_size=8, max_size=16))
 @example(["a|b " * 24, ":-:"])
 @example(["word " * 20, "- x", "1. x", "# x", "--- x"] * 2)
-def test_a_long_paragraph_of_any_words_is_read_back_unchanged(paragraph: list[str]) -> None:
+def test_long_paragraph_of_any_words_is_read_back_unchanged(paragraph: list[str]) -> None:
     joined = one_line(" ".join(paragraph))
     found = texts_of(markdown("All", [], [MarkdownTable("T", [joined])]))
     assert lines_of(found, "p") == paragraphs(joined)

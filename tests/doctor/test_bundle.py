@@ -119,7 +119,7 @@ def blocks(data: bytes) -> list[Block]:
 # --- content
 
 
-def test_the_bundle_has_all_parts_and_no_secret(setup: Path) -> None:
+def test_bundle_has_all_parts_and_no_secret(setup: Path) -> None:
     done, files = bundle(setup)
     assert done.code == 0, done
     assert done.out == ""
@@ -148,7 +148,7 @@ def test_the_bundle_has_all_parts_and_no_secret(setup: Path) -> None:
     assert str(setup) not in versions["sha256"], "the digest of a file with a secret"
 
 
-def test_the_old_name_of_the_option_writes_the_same_bundle(setup: Path, tmp_path: Path) -> None:
+def test_old_name_of_the_option_writes_the_same_bundle(setup: Path, tmp_path: Path) -> None:
     path = tmp_path / "old.zip"
     assert run("doctor", "-c", setup, "--parcel", path, "--without-captures").code == 0
     with zipfile.ZipFile(path) as found:
@@ -156,7 +156,7 @@ def test_the_old_name_of_the_option_writes_the_same_bundle(setup: Path, tmp_path
     assert "--parcel" not in run("doctor", "--help").out
 
 
-def test_the_readme_lists_what_was_removed_and_what_is_missing(setup: Path) -> None:
+def test_readme_lists_what_was_removed_and_what_is_missing(setup: Path) -> None:
     done, files = bundle(setup)
     readme = files["README.txt"].decode()
     for line in (
@@ -211,7 +211,7 @@ def test_holes_of_a_sparse_capture_are_not_read(setup: Path, tmp_path: Path) -> 
     assert kept == [found.number for found in blocks(begin)] + [7]
 
 
-def test_an_existing_file_is_kept_without_force(setup: Path) -> None:
+def test_existing_file_is_kept_without_force(setup: Path) -> None:
     path = written(setup.parent / "mine.zip", "x")
     assert "exists" in refused(2, "doctor", "-c", setup, "--bundle", path)
     assert path.read_text() == "x"
@@ -242,7 +242,7 @@ def test_an_existing_file_is_kept_without_force(setup: Path) -> None:
         (lambda file: (file.parent / "node.eds").write_text("x"), "is not an EDS"),
     ],
 )  # fmt: skip
-def test_a_fault_of_a_file_leaves_the_rest_of_the_bundle(
+def test_fault_of_a_file_leaves_the_rest_of_the_bundle(
     setup: Path, change: object, said: str
 ) -> None:
     assert callable(change)
@@ -256,13 +256,13 @@ def test_a_fault_of_a_file_leaves_the_rest_of_the_bundle(
     assert "hunter2" not in everything(files)
 
 
-def test_a_password_in_place_of_its_file_is_removed(setup: Path) -> None:
+def test_password_in_place_of_its_file_is_removed(setup: Path) -> None:
     setup.write_text(CONFIGURATION.replace("pass.txt", "p1ace of a key").replace("hunter2", ""))
     _, files = bundle(setup)
     assert "p1ace" not in everything(files)
 
 
-def test_a_machine_without_a_configuration_gets_a_bundle(
+def test_machine_without_a_configuration_gets_a_bundle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -309,7 +309,7 @@ def test_on_a_full_disk_the_largest_parts_are_left_out(
         assert contents.missing[0].startswith("part2: 0.1 MB")
 
 
-def test_a_disk_without_any_room_is_one_line(setup: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disk_without_any_room_is_one_line(setup: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(archive, "write_all", Disk(0).write)
     path = setup.parent / "bundle.zip"
     line = refused(1, "doctor", "-c", setup, "--bundle", path)
@@ -317,7 +317,7 @@ def test_a_disk_without_any_room_is_one_line(setup: Path, monkeypatch: pytest.Mo
     assert not list(setup.parent.glob("bundle.zip*"))
 
 
-def test_a_limit_of_the_system_for_files_leaves_out_captures(setup: Path) -> None:
+def test_limit_of_the_system_for_files_leaves_out_captures(setup: Path) -> None:
     """This is a real failure of write(2), in a process that may write small files only."""
     big = setup.parent / "captures" / f"big{SUFFIX}"
     noise = b"".join(block(b"D", n, os.urandom(1 << 16)) for n in range(20))
@@ -378,7 +378,7 @@ class Journal(Tree):
         return self.answer
 
 
-def test_the_journal_of_our_services_is_added_without_secrets(tmp_path: Path) -> None:
+def test_journal_of_our_services_is_added_without_secrets(tmp_path: Path) -> None:
     line = "2026-11-28T10:00:00+0000 pi kontronik-can-gw[6]: mqtt.broker: 'mqtt://a:hunter2@b' no"
     contents = Contents(Cleaner())
     add_journal(contents, Journal(tmp_path, f"-- Boot 1 --\n{line}\n", ""))
@@ -396,7 +396,7 @@ def test_the_journal_of_our_services_is_added_without_secrets(tmp_path: Path) ->
         ("No journal files were opened due to insufficient permissions.", "anna may not read it"),
     ],
 )
-def test_a_missing_journal_has_its_reason(tmp_path: Path, err: str | None, said: str) -> None:
+def test_missing_journal_has_its_reason(tmp_path: Path, err: str | None, said: str) -> None:
     contents = Contents(Cleaner())
     add_journal(contents, Journal(tmp_path, "-- No entries --\n" if err == "" else "", err))
     assert contents.parts == []
@@ -421,7 +421,7 @@ def test_captures_of_the_running_gateway_and_of_the_service_are_found(tmp_path: 
 
 
 @pytest.mark.parametrize("canopen", [False, True])
-def test_a_copy_without_secrets_replays_to_the_same_frames(tmp_path: Path, canopen: bool) -> None:
+def test_copy_without_secrets_replays_to_the_same_frames(tmp_path: Path, canopen: bool) -> None:
     bench = Bench(*made(2, canopen=canopen, dronecan={"enabled": True})).live(3, 2)
     original = capture_file(bench.setup, bench.entries, ["KOSMIK", "JIVEPRO"])
     chunks = [original[at : at + 999] for at in range(0, len(original), 999)]
@@ -438,7 +438,7 @@ def frames(folder: Path, data: bytes) -> list[object]:
         return [frame for batch in found.batches() for frame in batch]
 
 
-def test_a_copy_without_the_dbc_keeps_telemetry(tmp_path: Path) -> None:
+def test_copy_without_the_dbc_keeps_telemetry(tmp_path: Path) -> None:
     bench = Bench(*made(1)).live(3, 1)
     original = capture_file(bench.setup, bench.entries)
     copy = b"".join(clean_capture([original], "c", Cleaner(), with_dbc=False))
@@ -463,7 +463,7 @@ def test_damage_and_unknown_blocks_are_left_out_of_a_copy() -> None:
     assert cleaner.removed["c"]["block of an unknown kind"] == 1
 
 
-def test_the_header_of_a_capture_of_another_version_is_cleaned_too() -> None:
+def test_header_of_a_capture_of_another_version_is_cleaned_too() -> None:
     header = {"configuration": 'password = "hunter2"', "new": ["mqtt://a:hunter2@b"], "dbc": None}
     data = block(b"H", 0, json.dumps(header).encode())
     copy = b"".join(clean_capture([data], "c", Cleaner(), with_dbc=True))

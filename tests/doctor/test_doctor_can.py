@@ -103,7 +103,7 @@ DOWN = {"flags": "0x40040"}
          "can.data_bitrate is 2000000"),
     ],
 )  # fmt: skip
-def test_a_wrong_setting_is_reported_with_the_command_that_corrects_it(
+def test_wrong_setting_is_reported_with_the_command_that_corrects_it(
     tree: Tree,
     change: dict[str, Any],
     can: CanConfig,
@@ -120,7 +120,7 @@ def test_a_wrong_setting_is_reported_with_the_command_that_corrects_it(
     assert grave(findings).keys() == expected, "a cause is reported once"
 
 
-def test_a_missing_interface_is_reported_with_the_existing_ones(tree: Tree) -> None:
+def test_missing_interface_is_reported_with_the_existing_ones(tree: Tree) -> None:
     found = only(check_can(tree, PLAIN), "can.exists")
     assert found.severity == ERROR
     assert found.command == "sudo ip link add can0 type vcan && sudo ip link set can0 up"
@@ -129,7 +129,7 @@ def test_a_missing_interface_is_reported_with_the_existing_ones(tree: Tree) -> N
     assert only(check_can(tree, PLAIN), "can.exists").remedy == "Set can.channel: can1"
 
 
-def test_a_virtual_interface_is_noted_and_has_its_own_commands(tree: Tree) -> None:
+def test_virtual_interface_is_noted_and_has_its_own_commands(tree: Tree) -> None:
     change = DOWN | {"linkinfo": {"info_kind": "vcan"}}
     interface(tree, change)
     findings = check_can(tree, FD)
@@ -154,7 +154,7 @@ def test_vcan_has_its_own_commands_even_without_ip(tree: Tree) -> None:
     assert only(found, "can.up").command == "sudo ip link set vcan0 up"
 
 
-def test_a_missing_can_driver_and_another_kind_of_interface_are_reported(tree: Tree) -> None:
+def test_missing_can_driver_and_another_kind_of_interface_are_reported(tree: Tree) -> None:
     interface(tree, {"type": "1"})
     found = only(check_can(tree, PLAIN), "can.exists")
     assert found.severity == ERROR

@@ -30,7 +30,7 @@ def findings(tree: Tree) -> list[Finding]:
         (False, "chronyd", "warning", "chronyd runs", "chronyc tracking"),
     ],
 )  # fmt: skip
-def test_a_clock_that_is_not_synchronised_is_a_warning_with_the_remedy(
+def test_clock_that_is_not_synchronised_is_a_warning_with_the_remedy(
     tmp_path: Path,
     is_synchronized: bool | None,
     process: str,
@@ -52,7 +52,7 @@ def test_a_clock_that_is_not_synchronised_is_a_warning_with_the_remedy(
     ("hardware", "severity", "text"),
     [("rtc-ds3231", "ok", "rtc-ds3231"), ("", "note", "after power was off")],
 )
-def test_a_missing_hardware_clock_is_a_note(
+def test_missing_hardware_clock_is_a_note(
     tmp_path: Path, hardware: str, severity: str, text: str
 ) -> None:
     tree = Tree(tmp_path)
@@ -64,7 +64,7 @@ def test_a_missing_hardware_clock_is_a_note(
     assert [each.check for each in findings(tree)] == ["machine.clock"]
 
 
-def test_the_clock_of_this_machine_can_be_read(tmp_path: Path) -> None:
+def test_clock_of_this_machine_can_be_read(tmp_path: Path) -> None:
     (tmp_path / "sys/class/rtc/rtc0").mkdir(parents=True)
     (tmp_path / "sys/class/rtc/rtc0/name").write_text("rtc-test\n")
     clock = Machine(tmp_path).clock()

@@ -53,9 +53,7 @@ def document(file: Path, code: int) -> tuple[list[dict[str, str]], list[dict[str
     return findings, errors
 
 
-def test_a_usable_setup_has_exit_code_0_and_plain_text_in_a_pipe(
-    tmp_path: Path, esc: PtyEsc
-) -> None:
+def test_usable_setup_has_exit_code_0_and_plain_text_in_a_pipe(tmp_path: Path, esc: PtyEsc) -> None:
     done = run("doctor", "-c", configuration(tmp_path, esc.path))
     assert done.code == 0
     assert done.err == ""
@@ -79,7 +77,7 @@ def test_a_usable_setup_has_exit_code_0_and_plain_text_in_a_pipe(
         ),
     ],
 )  # fmt: skip
-def test_an_error_has_its_exit_code_and_the_rest_is_still_checked(
+def test_error_has_its_exit_code_and_the_rest_is_still_checked(
     more: str,
     port: str,
     code: int,
@@ -113,7 +111,7 @@ def test_modules_of_doctor_do_not_open_a_device() -> None:
             assert not name.startswith(("open", "write", "O_", "tcset")) or name == "openers"
 
 
-def test_the_reason_for_missing_telemetry_is_a_warning(tmp_path: Path, esc: PtyEsc) -> None:
+def test_reason_for_missing_telemetry_is_a_warning(tmp_path: Path, esc: PtyEsc) -> None:
     file = configuration(tmp_path, esc.path, '[statistics]\nfile = "status.json"')
     why = "live frames of 38 bytes whose CRC covers 34 bytes instead of 32"
 

@@ -52,7 +52,7 @@ def service(tree: Tree) -> list[Finding]:
         ({"User": "bob"}, "user", NOTE, f"sudo -u bob kontronik-can-gw doctor -c {CONFIG}"),
     ],
 )
-def test_the_state_of_the_service_is_reported(
+def test_state_of_the_service_is_reported(
     tree: Tree,
     shown: dict[str, str],
     check: str,
@@ -94,7 +94,7 @@ def test_without_systemd_an_installation_is_not_advised(tree: Tree, folder: str)
         ("/var/lib", ROOM, "of a gateway", NOTE, "perhaps the running gateway may"),
     ],
 )
-def test_a_folder_must_be_writable_by_this_user_or_systemd(
+def test_folder_must_be_writable_by_this_user_or_systemd(
     tree: Tree,
     there: str,
     space: tuple[bool, int],
@@ -155,7 +155,7 @@ def test_parameters_on_a_file_system_without_journal_get_a_warning(
         assert found.remedy == "Choose a folder on ext4 or f2fs as canopen.store:"
 
 
-def test_a_machine_without_a_list_of_mounts_gets_no_warning(tree: Tree) -> None:
+def test_machine_without_a_list_of_mounts_gets_no_warning(tree: Tree) -> None:
     findings = Findings("Configuration")
     check_file_system(tree, findings, "stored parameters", "/boot")
     assert findings.found == []
@@ -164,7 +164,7 @@ def test_a_machine_without_a_list_of_mounts_gets_no_warning(tree: Tree) -> None:
 # --- the real machine
 
 
-def test_a_program_that_has_the_terminal_open_is_found() -> None:
+def test_program_that_has_the_terminal_open_is_found() -> None:
     master, slave = os.openpty()
     status = Machine().status(os.ttyname(slave))
     assert status is not None
@@ -178,7 +178,7 @@ def test_a_program_that_has_the_terminal_open_is_found() -> None:
     os.close(slave)
 
 
-def test_the_real_machine_is_checked_without_an_exception() -> None:
+def test_real_machine_is_checked_without_an_exception() -> None:
     machine = Machine()
     assert machine.processes
     assert machine.space("/proc")

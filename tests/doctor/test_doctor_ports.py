@@ -129,7 +129,7 @@ def test_findings_at_a_port_are_reported(
         ([FTDI, methodcaller("file", "/sys/class/tty/console/active", "ttyUSB01 tty0\n")], BY_ID),
     ],
 )
-def test_a_good_port_has_only_results_that_are_ok(tree: Tree, given: list[Set], port: str) -> None:
+def test_good_port_has_only_results_that_are_ok(tree: Tree, given: list[Set], port: str) -> None:
     for each in (*given, root):
         each(tree)
     findings = check_port(tree, "esc1", port, even_parity=True)

@@ -69,7 +69,7 @@ def cleaned(text: str, **known: str) -> str:
         ("Nov 28 pi gw[1]: /etc/x/hunter2: has no password on its first line", "hunter2"),
     ],
 )  # fmt: skip
-def test_a_secret_is_removed_from_a_line(text: str, secret: str) -> None:
+def test_secret_is_removed_from_a_line(text: str, secret: str) -> None:
     assert secret in text
     found = cleaned(f"before\n{text}\nafter\n")
     assert secret not in found
@@ -93,7 +93,7 @@ def test_a_secret_is_removed_from_a_line(text: str, secret: str) -> None:
         "",
     ],
 )
-def test_a_line_without_a_secret_stays(text: str) -> None:
+def test_line_without_a_secret_stays(text: str) -> None:
     assert cleaned(text) == text
 
 
@@ -107,17 +107,17 @@ def test_a_line_without_a_secret_stays(text: str) -> None:
         ("1234", "it is 1234."),
     ],
 )
-def test_a_known_secret_is_removed_in_every_spelling(secret: str, text: str) -> None:
+def test_known_secret_is_removed_in_every_spelling(secret: str, text: str) -> None:
     found = cleaned(text, password=secret)
     assert found.startswith(f"it is {REMOVED}")
 
 
-def test_a_short_known_secret_is_removed_only_as_a_word() -> None:
+def test_short_known_secret_is_removed_only_as_a_word() -> None:
     assert cleaned("the latest test of 12 ms", password="test") == f"the latest {REMOVED} of 12 ms"
     assert cleaned("12 ms", password="12") == "12 ms"
 
 
-def test_a_document_keeps_its_names_and_loses_its_secrets() -> None:
+def test_document_keeps_its_names_and_loses_its_secrets() -> None:
     cleaner = Cleaner({"hunter2": "mqtt.username"})
     document = {
         "mqtt": {"username": "anna", "password": None, "tls": True, "port": 1883},
@@ -163,7 +163,7 @@ certificate = "{PEM.encode("unicode_escape").decode()}"
 """
 
 
-def test_a_configuration_loses_secrets_and_comments_and_stays_valid() -> None:
+def test_configuration_loses_secrets_and_comments_and_stays_valid() -> None:
     found = clean_toml(TOML, "gateway.toml", Cleaner())
     assert "hunter2" not in found
     assert "1234567" not in found
@@ -192,7 +192,7 @@ def test_a_configuration_loses_secrets_and_comments_and_stays_valid() -> None:
         'access_code = ["hunter2",\n"hunter2"]\n',
     ],
 )
-def test_an_option_whose_meaning_is_unknown_loses_its_value(text: str) -> None:
+def test_option_whose_meaning_is_unknown_loses_its_value(text: str) -> None:
     tomllib.loads(text)
     found = clean_toml(text, "gateway.toml", Cleaner())
     assert "hunter2" not in found
@@ -211,7 +211,7 @@ def test_an_option_whose_meaning_is_unknown_loses_its_value(text: str) -> None:
         "[mqtt] # hunter2",
     ],
 )
-def test_a_configuration_that_is_not_valid_loses_its_secrets_too(broken: str) -> None:
+def test_configuration_that_is_not_valid_loses_its_secrets_too(broken: str) -> None:
     assert "hunter2" not in clean_toml(broken, "gateway.toml", Cleaner())
 
 
@@ -275,7 +275,7 @@ BA_ "Plant" BO_ 100 "hunter2";
 """
 
 
-def test_a_dbc_loses_comments_and_secret_attributes_and_nothing_else() -> None:
+def test_dbc_loses_comments_and_secret_attributes_and_nothing_else() -> None:
     cleaner = Cleaner()
     found = clean_dbc(DBC, "x.dbc", cleaner)
     assert "hunter2" not in found
@@ -289,7 +289,7 @@ def test_a_dbc_loses_comments_and_secret_attributes_and_nothing_else() -> None:
     assert cleaner.removed["x.dbc"]["attribute SeedKey"] == 3
 
 
-def test_a_line_that_is_no_dbc_loses_its_secret() -> None:
+def test_line_that_is_no_dbc_loses_its_secret() -> None:
     text = DBC.replace("# password", "the password:")
     assert "the password: hunter2" in text
     assert "hunter2" not in clean_dbc(text, "x.dbc", Cleaner())
@@ -300,7 +300,7 @@ def test_a_line_that_is_no_dbc_loses_its_secret() -> None:
     [shipped("dbc/kontronik_esc.dbc"), *sorted(PROJECT.glob("examples/*/*.dbc"))],
     ids=lambda path: path.parent.name,
 )
-def test_a_dbc_has_the_same_messages_without_its_comments(path: Path) -> None:
+def test_dbc_has_the_same_messages_without_its_comments(path: Path) -> None:
     original = path.read_bytes()
     cleaner = Cleaner()
     data = clean_dbc(original.decode("latin-1"), "x", cleaner).encode("latin-1")
@@ -340,7 +340,7 @@ DefaultValue=5
 """
 
 
-def test_an_eds_loses_comments_and_values_of_objects_with_secret_names() -> None:
+def test_eds_loses_comments_and_values_of_objects_with_secret_names() -> None:
     found = clean_eds(EDS, "x.eds", Cleaner())
     assert "hunter2" not in found
     assert "C0FFEE" not in found
@@ -348,7 +348,7 @@ def test_an_eds_loses_comments_and_values_of_objects_with_secret_names() -> None
     assert found.count("\n") == EDS.count("\n")
 
 
-def test_the_shipped_eds_loses_only_comments() -> None:
+def test_shipped_eds_loses_only_comments() -> None:
     text = shipped("eds/kontronik_esc.eds").read_bytes().decode("latin-1")
     cleaner = Cleaner()
     found = clean_eds(text, "x", cleaner)
@@ -358,5 +358,5 @@ def test_the_shipped_eds_loses_only_comments() -> None:
 
 
 @pytest.mark.parametrize("name", ["monkey", "keyboard", "passenger_count", "compass", "userspace"])
-def test_a_name_that_only_resembles_a_secret_is_kept(name: str) -> None:
+def test_name_that_only_resembles_a_secret_is_kept(name: str) -> None:
     assert not is_secret_name(name)

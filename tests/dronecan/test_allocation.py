@@ -61,7 +61,7 @@ def test_without_an_allocator_a_node_only_repeats_its_request() -> None:
     assert other != again
 
 
-def test_the_parts_of_an_id_are_sent_in_turn_and_repeated_without_answer() -> None:
+def test_parts_of_an_id_are_sent_in_turn_and_repeated_without_answer() -> None:
     bench = waiting().run(1.1)
     (own,) = unique_ids(bench)
     receive_allocation(bench, 0, own[:6])
@@ -106,7 +106,7 @@ def test_nodes_get_node_ids_in_turn_and_never_the_same_one() -> None:
         assert node_ids(bench) == found
 
 
-def test_an_allocator_that_lies_sets_no_node_id_and_does_no_harm() -> None:
+def test_allocator_that_lies_sets_no_node_id_and_does_no_harm() -> None:
     """The unique ids match ours in part, are too long or belong to others. Requests continue."""
     rng = random.Random(4)
     bench = waiting().run(1.1)

@@ -21,7 +21,7 @@ pytestmark = [
 ]
 
 
-def test_the_crate_reads_the_same_transfers_as_the_package() -> None:
+def test_crate_reads_the_same_transfers_as_the_package() -> None:
     need(READER.exists(), "dronecan-reader")
     rng = random.Random(3)
     bench = Bench(4, extended_hz=10)

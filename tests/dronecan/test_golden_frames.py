@@ -106,7 +106,7 @@ def test_messages_equal_the_golden_frames(is_pure: bool) -> None:
     assert shown(frames) == "1801552A#6400000000EFBEC5"
 
 
-def test_an_answer_equals_the_golden_frames() -> None:
+def test_answer_equals_the_golden_frames() -> None:
     state = wire.NODE_STATUS.pack(100, wire.OK << 6 | wire.OPERATIONAL << 3, 0xBEEF)
     info = wire.GET_NODE_INFO.pack(state, 1, 2, 0, 0, 0, 3, 4, UNIQUE_ID, 0) + b"org.example.esc"
     request = 0x10018000 | 42 << 8 | 0x80 | 10
@@ -213,7 +213,7 @@ def test_transfers_are_assembled_from_mixed_frames() -> None:
     assert sorted(received(mixed)) == sorted(wanted)
 
 
-def test_a_transfer_that_is_damaged_or_late_is_dropped() -> None:
+def test_transfer_that_is_damaged_or_late_is_dropped() -> None:
     frames = request(9, b"e0.pole_pairs")
     assert received(frames)
     assert received(frames, 800_000_000)

@@ -71,7 +71,7 @@ def storm(count: int, seed: int, node_id: int) -> Bench:
         pytest.param(10**6, marks=pytest.mark.extended),
     ],
 )
-def test_a_hostile_bus_does_no_harm(count: int, node_id: int) -> None:
+def test_hostile_bus_does_no_harm(count: int, node_id: int) -> None:
     """The storm is reported, and after it everything works as before."""
     tracemalloc.start()
     try:

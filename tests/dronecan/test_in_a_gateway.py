@@ -120,7 +120,7 @@ def test_check_warns_of_unusual_settings(
         ({"name": "Left"}, 'name: "Left" is not a name of 1 to 60 lower-case letters'),
     ],
 )
-def test_a_mistake_is_refused_in_one_line(table: dict[str, Any], reason: str) -> None:
+def test_mistake_is_refused_in_one_line(table: dict[str, Any], reason: str) -> None:
     with pytest.raises(UserError) as caught:
         loaded(2, **table)
     (line,) = caught.value.problems
@@ -140,7 +140,7 @@ def test_a_mistake_is_refused_in_one_line(table: dict[str, Any], reason: str) ->
         (0x2B - (1 << 31), "node_id = 42\nper_esc_nodes = true", ""),  # 11 bits: another frame
     ],
 )
-def test_a_dbc_whose_ids_are_frames_of_our_node_is_refused(
+def test_dbc_whose_ids_are_frames_of_our_node_is_refused(
     tmp_path: Path,
     can_id: int,
     more: str,
@@ -202,7 +202,7 @@ def test_other_outputs_send_the_same_frames_with_and_without_it(canopen: bool) -
     assert len(found[0]) > 1000
 
 
-def test_a_replay_of_nodes_that_wait_for_node_ids_is_identical() -> None:
+def test_replay_of_nodes_that_wait_for_node_ids_is_identical() -> None:
     """Requests for node-IDs have random pauses, which follow from the seed in the header."""
     setup, layout = capture_bench.made(2, dronecan=ON | {"node_id": 0})
     bench = capture_bench.Bench(setup, layout).live(0, 6)
@@ -211,7 +211,7 @@ def test_a_replay_of_nodes_that_wait_for_node_ids_is_identical() -> None:
     assert any(each.frame.extended for each in frames)
 
 
-def test_a_capture_header_that_no_recorder_writes_is_refused() -> None:
+def test_capture_header_that_no_recorder_writes_is_refused() -> None:
     setup, _ = capture_bench.made(2, dronecan=ON)
     header: dict[str, Any] = json.loads(json.dumps(setup.header()))
     ours = header["outputs"].pop("dronecan")
@@ -249,7 +249,7 @@ def test_measurements_do_not_need_python() -> None:
     assert len(bench.of("StatusExtended")) in (2 * 200, 2 * 201)
 
 
-def test_a_bus_that_is_too_slow_gets_complete_transfers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bus_that_is_too_slow_gets_complete_transfers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Newer values of two ESCs replace waiting ones, but a transfer that began is completed."""
     world = wire_world.World(2)
     setup = loaded(2)

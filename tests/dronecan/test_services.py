@@ -92,7 +92,7 @@ def test_commands_of_an_autopilot_are_never_received() -> None:
                     assert (key ^ block) & mask
 
 
-def test_a_flood_of_requests_is_answered_only_in_part() -> None:
+def test_flood_of_requests_is_answered_only_in_part() -> None:
     bench = Bench().run(0.5)
     for _ in range(2000):
         bench.receive(*peers_frames(protocol.GetNodeInfo.Request(), 100, to=42))

@@ -78,7 +78,7 @@ def test_rpm_of_a_backward_motor_is_negative_unless_that_is_off(
         (7, 10),
     ],
 )
-def test_the_rate_is_kept_on_average_at_any_rate_of_telemetry(rate_hz: int, live_ms: int) -> None:
+def test_rate_is_kept_on_average_at_any_rate_of_telemetry(rate_hz: int, live_ms: int) -> None:
     """A frame of the ESC causes a Status if it arrives at about the right time, else the clock.
 
     StatusExtended is sent only if configured.
@@ -101,7 +101,7 @@ def test_the_rate_is_kept_on_average_at_any_rate_of_telemetry(rate_hz: int, live
         (Device.JIVEPRO, math.nan),
     ],
 )
-def test_the_bec_is_sent_once_a_second_with_nan_for_missing_values(
+def test_bec_is_sent_once_a_second_with_nan_for_missing_values(
     device: Device,
     amperes: float,
 ) -> None:
@@ -176,7 +176,7 @@ def test_errors_of_an_esc_change_health_only_if_configured(health: str) -> None:
     assert {each.payload.mode for each in bench.of("NodeStatus")} == {wire.OPERATIONAL}
 
 
-def test_a_node_sends_its_status_and_the_gateways_health_each_second() -> None:
+def test_node_sends_its_status_and_the_gateways_health_each_second() -> None:
     """Without telemetry it sends nothing else.
 
     NodeStatus has the lowest error bits, and at the end the node reports that it is offline.
@@ -263,7 +263,7 @@ def test_errors_are_logged_with_the_remedy_when_they_begin_and_end() -> None:
     assert text_of(silent.run(2)) == ""
 
 
-def test_a_bit_is_logged_at_most_each_ten_seconds() -> None:
+def test_bit_is_logged_at_most_each_ten_seconds() -> None:
     """One bit flaps all the time, and another one is on when the bus returns."""
     bench = Bench()
     for turn in range(600):

@@ -182,7 +182,7 @@ def there(values: dict[Any, Any]) -> dict[Any, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def test_a_capture_names_the_protocol() -> None:
+def test_capture_names_the_protocol() -> None:
     """A capture of version 0.5.0 does not name one, so the first protocol is used."""
     escs = tuple(parse(MIXED, "mixed.toml").escs)
     setup = CaptureSetup(escs, ("a", "b"), None, DbcConfig(), False)

@@ -87,7 +87,7 @@ def test_values_delayed_by_a_slow_bus_are_right_and_counted(judge: Judge) -> Non
         ([-10], MS, "never sent"),
     ],
 )
-def test_a_wrong_value_is_reported_with_its_reason(
+def test_wrong_value_is_reported_with_its_reason(
     judge: Judge,
     given: list[int | tuple[int, int]],
     late: int,
@@ -111,7 +111,7 @@ def test_a_wrong_value_is_reported_with_its_reason(
     assert judge.wrong_count == 1
 
 
-def test_a_data_age_that_is_too_low_is_wrong(judge: Judge) -> None:
+def test_data_age_that_is_too_low_is_wrong(judge: Judge) -> None:
     place = next(place for place in judge.table[LINK_ID].places if place.name == "data_age")
     late = START + 49 * PERIOD + SECOND
     judge.take(LINK_ID, (1000 << place.start).to_bytes(8, "little"), late)

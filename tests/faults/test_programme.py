@@ -38,7 +38,7 @@ def row(
         ({"injected": 0, "recovered": 0}, FAILED),
     ],
 )
-def test_a_fault_is_good_if_it_always_healed_without_wrong_or_lost_values(
+def test_fault_is_good_if_it_always_healed_without_wrong_or_lost_values(
     counts: dict[str, Any],
     state: str,
 ) -> None:
@@ -67,7 +67,7 @@ def test_both_reports_contain_the_states(
 
 @pytest.mark.extended
 @pytest.mark.usefixtures("c_compiler")
-def test_a_machine_with_virtual_time_sleeps_an_hour_at_once() -> None:
+def test_machine_with_virtual_time_sleeps_an_hour_at_once() -> None:
     busy = "import time; end = time.monotonic() + 0.1\nwhile time.monotonic() < end: pass"
     command = [
         sys.executable,
@@ -102,7 +102,7 @@ def test_bytes_to_an_esc_count_only_after_the_gateway_has_set_the_port() -> None
     assert adapter.received == 2
 
 
-def test_a_gateway_that_ended_is_reported_as_ended() -> None:
+def test_gateway_that_ended_is_reported_as_ended() -> None:
     bench = Bench.__new__(Bench)
     row = Row("x", None)
     with subprocess.Popen(["false"]) as process:
@@ -113,7 +113,7 @@ def test_a_gateway_that_ended_is_reported_as_ended() -> None:
     assert row.notes == ["the gateway ended with 1; the gateway's last lines: the last word"]
 
 
-def test_the_page_shows_each_fault_healed_without_wrong_or_lost_values() -> None:
+def test_page_shows_each_fault_healed_without_wrong_or_lost_values() -> None:
     found = shown(PAGE.read_text())
     assert list(found) == [str(fault) for fault in in_order()]
     assert len(set(map(str, FAULTS))) == len(FAULTS)
@@ -155,7 +155,7 @@ def test_memory_is_judged_by_its_slope(kib_per_hour: float, hours: float, is_goo
     assert slope_kib_per_hour(late) == pytest.approx(kib_per_hour, rel=0.02, abs=15)
 
 
-def test_the_slope_of_few_samples_is_zero() -> None:
+def test_slope_of_few_samples_is_zero() -> None:
     assert slope_kib_per_hour([]) == slope_kib_per_hour([Sample(1, 2)]) == 0
     assert faults_in([]) == []
 

@@ -136,7 +136,7 @@ def test_each_folder_with_a_setup_is_an_output() -> None:
     assert folders == set(OUTPUTS), "add the folder's name to OUTPUTS in core/output_setup.py"
 
 
-def test_the_header_of_a_capture_gives_an_equal_setup(name: str) -> None:
+def test_header_of_a_capture_gives_an_equal_setup(name: str) -> None:
     setup = configured(name)
     header: dict[str, Any] = json.loads(json.dumps(setup.header()))
     assert CaptureSetup.of(header).outputs == setup.outputs
@@ -144,12 +144,12 @@ def test_the_header_of_a_capture_gives_an_equal_setup(name: str) -> None:
 
 
 @pytest.mark.parametrize("quiet_after_s", [0, 1])
-def test_a_replay_is_identical_to_the_run(name: str, quiet_after_s: int) -> None:
+def test_replay_is_identical_to_the_run(name: str, quiet_after_s: int) -> None:
     check_replay(configured(name, quiet_after_s=quiet_after_s), seed=0)
 
 
 @pytest.mark.parametrize("quiet_after_s", [0, 1])
-def test_a_replay_of_all_outputs_together_is_identical(quiet_after_s: int) -> None:
+def test_replay_of_all_outputs_together_is_identical(quiet_after_s: int) -> None:
     check_replay(configured(*OUTPUTS, quiet_after_s=quiet_after_s), seed=1)
 
 
@@ -181,7 +181,7 @@ def test_nothing_is_sent_while_frames_are_held_and_all_after_it(name: str) -> No
     assert {frame.can_id for frame in bench.run(2)} >= before
 
 
-def test_the_first_frame_after_an_outage_has_no_measurement(name: str) -> None:
+def test_first_frame_after_an_outage_has_no_measurement(name: str) -> None:
     """It is the same for any telemetry, and other frames are not."""
     first = []
     others = []

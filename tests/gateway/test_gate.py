@@ -92,7 +92,7 @@ def test_all_states_that_can_be_reached_keep_the_invariants() -> None:
     assert found.rows.keys() == set(TABLE), [row for row in TABLE if row not in found.rows]
 
 
-def test_a_count_of_0_blocks_nothing() -> None:
+def test_count_of_0_blocks_nothing() -> None:
     """There are drivers that do not count."""
     gate = Gate(TIMEOUT)
     gate.opened(0, 0)
@@ -101,7 +101,7 @@ def test_a_count_of_0_blocks_nothing() -> None:
     assert gate.state is State.OPEN
 
 
-def test_the_limit_of_a_slow_bus_halves_and_grows() -> None:
+def test_limit_of_a_slow_bus_halves_and_grows() -> None:
     gate = Gate(TIMEOUT)
     gate.opened(7, 0)
     gate.accepted(8, 0)
@@ -135,7 +135,7 @@ def test_frames_of_another_program_do_not_count_as_own_departures() -> None:
     assert POLL_NS <= 2 * MS
 
 
-def test_a_slow_bus_that_was_blocked_and_is_free_again_is_no_longer_reported() -> None:
+def test_slow_bus_that_was_blocked_and_is_free_again_is_no_longer_reported() -> None:
     gate = Gate(TIMEOUT)
     gate.opened(7, 0)
     gate.accepted(8, 0)
@@ -159,7 +159,7 @@ def test_a_slow_bus_that_was_blocked_and_is_free_again_is_no_longer_reported() -
     assert not gate.is_slow
 
 
-def test_a_request_in_a_bus_off_of_a_parked_vehicle_leaves_the_bus_off_as_it_is() -> None:
+def test_request_in_a_bus_off_of_a_parked_vehicle_leaves_the_bus_off_as_it_is() -> None:
     gate = Gate(TIMEOUT, RESTART_AFTER)
     gate.opened(7, 0)
     gate.bus_off(stays=True, now=0)
@@ -169,7 +169,7 @@ def test_a_request_in_a_bus_off_of_a_parked_vehicle_leaves_the_bus_off_as_it_is(
     assert gate.left_bus_off(is_running=True, is_reported=False, now=800 * MS)
 
 
-def test_a_frame_that_the_driver_lost_does_not_block_a_gateway_without_a_first_frame() -> None:
+def test_frame_that_the_driver_lost_does_not_block_a_gateway_without_a_first_frame() -> None:
     gate = Gate(TIMEOUT)
     gate.opened(7, 0)
     gate.accepted(2, 0)
@@ -184,7 +184,7 @@ def test_a_frame_that_the_driver_lost_does_not_block_a_gateway_without_a_first_f
             gate.no_first_frame(now)
 
 
-def test_a_blocked_bus_is_no_fault_of_a_parked_vehicle() -> None:
+def test_blocked_bus_is_no_fault_of_a_parked_vehicle() -> None:
     gate = Gate(TIMEOUT)
     gate.opened(7, 0)
     gate.accepted(1, 0)

@@ -24,7 +24,7 @@ def table() -> list[str]:
     return lines
 
 
-def test_the_table_of_the_gate_in_the_docs_is_the_one_of_the_code() -> None:
+def test_table_of_the_gate_in_the_docs_is_the_one_of_the_code() -> None:
     lines = DESIGN.read_text().splitlines()
     begin = lines.index(HEAD[0])
     end = begin + lines[begin:].index("")

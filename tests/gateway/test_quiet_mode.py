@@ -110,7 +110,7 @@ class Bench:
         return frames
 
 
-def test_the_last_frame_reports_quiet_at_the_configured_time() -> None:
+def test_last_frame_reports_quiet_at_the_configured_time() -> None:
     bench = Bench(loaded())
     bench.until_quiet()
     when, frame = bench.sent[-1]
@@ -120,13 +120,13 @@ def test_the_last_frame_reports_quiet_at_the_configured_time() -> None:
     assert bench.gateway.status.state is GatewayState.QUIET
 
 
-def test_a_gateway_that_never_hears_an_esc_becomes_quiet_after_its_start() -> None:
+def test_gateway_that_never_hears_an_esc_becomes_quiet_after_its_start() -> None:
     bench = Bench(loaded())
     bench.run(10)
     assert bench.sent[-1][0] == SECOND + QUIET_AFTER
 
 
-def test_a_dbc_whose_value_table_has_no_quiet_causes_a_warning() -> None:
+def test_dbc_whose_value_table_has_no_quiet_causes_a_warning() -> None:
     given = loaded(file=str(OF_0_5_0))
     (warning,) = [each for each in given.warnings if "Quiet" in each]
     assert "GatewayStatus.GatewayState: its value table has no Quiet" in warning
@@ -152,7 +152,7 @@ def test_one_heard_esc_prevents_quiet_mode() -> None:
     assert not bench.gateway.status.is_quiet
 
 
-def test_a_lost_port_leads_to_quiet_mode_as_silence_does() -> None:
+def test_lost_port_leads_to_quiet_mode_as_silence_does() -> None:
     bench = Bench(loaded())
     bench.run(1, 0)
     bench.gateway.port(0, False, bench.now)
@@ -252,7 +252,7 @@ def test_changes_of_the_interface_cause_no_frames_in_quiet_mode() -> None:
     assert bench.run(60) == []
 
 
-def test_the_end_of_the_program_causes_no_frame_in_quiet_mode() -> None:
+def test_end_of_the_program_causes_no_frame_in_quiet_mode() -> None:
     bench = Bench(loaded(canopen=True, dronecan=True))
     bench.until_quiet()
     bench.gateway.stop(bench.now)
@@ -272,7 +272,7 @@ def test_telemetry_ends_quiet_mode_and_everything_is_sent_again() -> None:
     assert boots == [0x701, 0x702], "the nodes do not boot as after an outage"
 
 
-def test_an_error_that_begins_in_quiet_mode_is_reported_at_its_end() -> None:
+def test_error_that_begins_in_quiet_mode_is_reported_at_its_end() -> None:
     bench = Bench(loaded(canopen=True))
     bench.until_quiet()
     bench.gateway.parameters_damaged(0, bench.now)

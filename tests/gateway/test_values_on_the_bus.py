@@ -89,7 +89,7 @@ NO_BEC_CURRENT = 0xFFFF
         (Device.KOSMIK, 5),
     ],
 )
-def test_a_jivepros_bec_current_stays_unavailable_without_information(
+def test_jivepros_bec_current_stays_unavailable_without_information(
     device: Device,
     then: int,
 ) -> None:
@@ -157,7 +157,7 @@ def test_each_loss_of_telemetry_counts_once_whatever_its_cause() -> None:
         (1, LinkState.DEGRADED),
     ],
 )
-def test_a_link_is_degraded_above_a_tenth_of_dropped_bytes(more: int, link: LinkState) -> None:
+def test_link_is_degraded_above_a_tenth_of_dropped_bytes(more: int, link: LinkState) -> None:
     """18 frames and noise of two frames' length arrive in a second, and ``more`` bytes."""
     bench = Bench(SPEED)
     frame = wire(electrical_speed=1)
@@ -172,7 +172,7 @@ def test_a_link_is_degraded_above_a_tenth_of_dropped_bytes(more: int, link: Link
     assert bench.gateway.escs[0].link is link
 
 
-def test_a_dbc_with_a_byte_order_mark_and_a_text_enumeration_is_read() -> None:
+def test_dbc_with_a_byte_order_mark_and_a_text_enumeration_is_read() -> None:
     cycle = 'BA_ "GenMsgSendType" BO_ 256 "Cyclic";\nBA_ "GenMsgCycleTime" BO_ 256 20;\n'
     (message,) = compiled("\ufeff" + text_of(SPEED, cycle)).messages
     assert message.cycle_ns == 20 * MS

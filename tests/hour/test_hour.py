@@ -33,7 +33,7 @@ def minute(tmp_path_factory: pytest.TempPathFactory) -> Minute:
     return Minute(tmp_path_factory.mktemp("minute"))
 
 
-def test_the_minute_contains_every_kind_of_event(minute: Minute) -> None:
+def test_minute_contains_every_kind_of_event(minute: Minute) -> None:
     """There are losses, a lost port, a swapped device and errors, and each of them ends."""
     rows = minute.truth.columns()
     assert 4500 < len(minute.truth.row_ns) < 6000
@@ -105,7 +105,7 @@ FAULTS: tuple[tuple[str, str, Edit], ...] = (
 
 
 @pytest.mark.parametrize(("file", "what", "edit"), FAULTS, ids=lambda given: str(given)[:12])
-def test_a_falsified_file_is_detected(
+def test_falsified_file_is_detected(
     file: str,
     what: str,
     edit: Edit,
@@ -126,7 +126,7 @@ def test_a_falsified_file_is_detected(
     assert step.check(bad).problems
 
 
-def test_a_command_that_fails_ends_the_programme(tmp_path: Path) -> None:
+def test_command_that_fails_ends_the_programme(tmp_path: Path) -> None:
     words = ["convert", str(tmp_path / "none.kcap")]
     with pytest.raises(RuntimeError, match=r"exit code 2: .*none\.kcap"):
         Step("bad", words, tmp_path / "a.csv", lambda _: Verdict()).run()

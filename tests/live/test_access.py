@@ -93,7 +93,7 @@ def test_without_the_token_nothing_is_told(guarded: ServedPage) -> None:
     assert guarded.get("/", Cookie=wrong)[0] == 403
 
 
-def test_the_token_becomes_a_cookie_and_leaves_the_address(guarded: ServedPage) -> None:
+def test_token_becomes_a_cookie_and_leaves_the_address(guarded: ServedPage) -> None:
     status, headers, body = guarded.get(f"/?token={TOKEN}")
     assert status == 200
     assert TOKEN.encode() not in body
@@ -132,12 +132,12 @@ def test_connections_that_are_kept_open_leave_room_for_others(page: ServedPage) 
         sock.close()
 
 
-def test_a_used_port_is_one_clear_line(page: ServedPage) -> None:
+def test_used_port_is_one_clear_line(page: ServedPage) -> None:
     with pytest.raises(RunError, match=rf"--listen 127.0.0.1:{page.port}: cannot be used"):
         server.listen("127.0.0.1", page.port)
 
 
-def test_the_token_stays_and_only_its_owner_may_read_it(tmp_path: Path) -> None:
+def test_token_stays_and_only_its_owner_may_read_it(tmp_path: Path) -> None:
     folder = cache_folder(tmp_path / "cache")
     first = Address.stored(folder, "0.0.0.0", 8044, False)
     again = Address.stored(folder, "127.0.0.1", 9000, True)
@@ -153,7 +153,7 @@ def test_the_token_stays_and_only_its_owner_may_read_it(tmp_path: Path) -> None:
     assert Address.stored(folder, "127.0.0.1", 9000, True).token != first.token
 
 
-def test_the_addresses_of_this_machine_are_found_without_netlink(
+def test_addresses_of_this_machine_are_found_without_netlink(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The service's sandbox permits no netlink."""
@@ -172,7 +172,7 @@ def test_the_addresses_of_this_machine_are_found_without_netlink(
         assert f"http://{sock.getsockname()[0]}:8044/" in urls
 
 
-def test_a_cache_that_cannot_be_used_is_one_clear_line(tmp_path: Path) -> None:
+def test_cache_that_cannot_be_used_is_one_clear_line(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("")
     with pytest.raises(RunError, match=r"file: cannot be used: .*--cache"):

@@ -48,7 +48,7 @@ def test_every_figure_equals_the_decoded_frames() -> None:
             assert value[2:4] == [round(track.low or 0, digits), round(track.high or 0, digits)]
 
 
-def test_a_value_that_is_not_available_keeps_its_age() -> None:
+def test_value_that_is_not_available_keeps_its_age() -> None:
     content = content_of(["esc1"], 10, until=7)
     (esc,) = update_of(content, 10 * S)["escs"]
     value, age_s, low, high, mark = esc["values"][1]
@@ -58,7 +58,7 @@ def test_a_value_that_is_not_available_keeps_its_age() -> None:
     assert not esc["isGood"]
 
 
-def test_a_silent_gateway_is_reported_with_its_time() -> None:
+def test_silent_gateway_is_reported_with_its_time() -> None:
     content = content_of(["esc1"], 5)
     assert update_of(content, 5 * S)["state"][0] == "ok"
     assert update_of(content, 17 * S)["state"] == ["error", "no gateway heard for 12 s"]
@@ -81,7 +81,7 @@ def test_alarms_have_remedy_begin_and_end_and_the_newest_is_first() -> None:
     assert link["note"] == "its end is not known"
 
 
-def test_the_large_figures_begin_with_speed_and_end_with_temperatures() -> None:
+def test_large_figures_begin_with_speed_and_end_with_temperatures() -> None:
     quantities = json.loads(content_of(["esc1"], 1).layout())["quantities"]
     assert [each["source"] for each in quantities if each["isLarge"]] == [
         "motor_speed",
@@ -95,7 +95,7 @@ def test_the_large_figures_begin_with_speed_and_end_with_temperatures() -> None:
     assert [each["isLarge"] for each in quantities[:8]] == [True] * 7 + [False]
 
 
-def test_a_recording_is_named_as_one() -> None:
+def test_recording_is_named_as_one() -> None:
     bus = FedBus(["esc1"])
     assert json.loads(Content(bus).layout())["origin"] == ""
     bus.is_file = True
@@ -110,7 +110,7 @@ def test_reset_restarts_the_extremes_and_keeps_the_plots() -> None:
     assert update_of(content, 20 * S)["escs"][0]["values"][0][2:4] == [None, None]
 
 
-def test_a_step_has_the_extremes_of_its_second_in_their_order() -> None:
+def test_step_has_the_extremes_of_its_second_in_their_order() -> None:
     track = Track()
     for value in (5.0, 9.0, 2.0):
         track.add(value, 0)
@@ -130,7 +130,7 @@ def test_seconds_without_a_call_become_gaps() -> None:
     assert len(content.steps(10_000 * S)) == STEPS
 
 
-def test_a_recording_that_is_played_fast_has_no_gaps() -> None:
+def test_recording_that_is_played_fast_has_no_gaps() -> None:
     content = Content(FedBus(["esc1"]))
     for now, frame in flight(layout_of(["esc1"]), 20):
         content.take(frame, now)
@@ -140,7 +140,7 @@ def test_a_recording_that_is_played_fast_has_no_gaps() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 8])
-def test_the_plots_have_a_line_for_each_esc(count: int) -> None:
+def test_plots_have_a_line_for_each_esc(count: int) -> None:
     content = content_of([f"esc{number}" for number in range(count)], 3)
     layout = json.loads(content.layout())
     assert [plot["key"] for plot in layout["plots"]] == [

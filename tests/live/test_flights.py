@@ -92,7 +92,7 @@ def test_numbers_equal_the_evaluated_flight(page: ServedPage, folder: Path) -> N
     assert summary["duration"] == round((flight.end_ns - flight.start_ns) / 1e9, 1)
 
 
-def test_the_report_equals_that_of_the_command_and_is_kept(
+def test_report_equals_that_of_the_command_and_is_kept(
     page: ServedPage, folder: Path, tmp_path: Path
 ) -> None:
     flight = made(page, 1, "report")
@@ -164,7 +164,7 @@ def test_damaged_empty_and_unfinished_captures_are_explained(
 
 
 @pytest.mark.parametrize("what", ["missing", "file", "none"])
-def test_a_folder_that_cannot_be_read_is_one_line(tmp_path: Path, what: str) -> None:
+def test_folder_that_cannot_be_read_is_one_line(tmp_path: Path, what: str) -> None:
     given = None if what == "none" else tmp_path / what
     (tmp_path / "file").write_text("")
     with ServedPage(FedBus(["esc1"]), None, Flights(given, 0, tmp_path)) as page:
@@ -220,7 +220,7 @@ def test_one_file_is_made_at_a_time_and_a_report_goes_before_summaries(page: Ser
     assert state(page, 0, "report") == state(page, 1, "csv") == "made"
 
 
-def test_a_child_process_has_limits_and_low_priority() -> None:
+def test_child_process_has_limits_and_low_priority() -> None:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         flights_module._restrict(child.pid)
         assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
@@ -232,7 +232,7 @@ def test_a_child_process_has_limits_and_low_priority() -> None:
         child.communicate(b"\n")
 
 
-def test_a_child_process_that_takes_too_long_is_ended(
+def test_child_process_that_takes_too_long_is_ended(
     page: ServedPage, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "sleeps.py").write_text("import time; time.sleep(1000)")
@@ -246,7 +246,7 @@ def test_a_child_process_that_takes_too_long_is_ended(
     assert "too much memory or time" in state(page, 0, "csv")["failed"]
 
 
-def test_a_short_disk_is_told_on_the_page(folder: Path, tmp_path: Path) -> None:
+def test_short_disk_is_told_on_the_page(folder: Path, tmp_path: Path) -> None:
     flights = Flights(folder, 1 << 60, tmp_path)
     with ServedPage(FedBus(["esc1"]), None, flights):
         wait_until(lambda: "MB free" in flights.disk(), "the line")

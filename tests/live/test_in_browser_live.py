@@ -98,7 +98,7 @@ def test_every_figure_equals_the_decoded_frame(
     assert all(address.startswith((page.url, "data:")) for address in browser.requests)
 
 
-def test_a_page_without_messages_never_looks_alive(
+def test_page_without_messages_never_looks_alive(
     browser: Browser, bus: FedBus, page: ServedPage
 ) -> None:
     """The connection loses all packets and is not closed."""
@@ -125,7 +125,7 @@ def test_a_page_without_messages_never_looks_alive(
         wait_until(lambda: not browser.run(is_stale), "a live page")
 
 
-def test_a_page_continues_after_a_restart_of_the_server(
+def test_page_continues_after_a_restart_of_the_server(
     browser: Browser, bus: FedBus, page: ServedPage
 ) -> None:
     fly(bus, 5)
@@ -170,7 +170,7 @@ def test_one_esc_loses_telemetry_and_the_other_goes_on(
     assert "running" in browser.run("document.querySelector('#state').textContent")
 
 
-def test_an_error_is_in_title_and_icon_and_a_silent_gateway_is_told(
+def test_error_is_in_title_and_icon_and_a_silent_gateway_is_told(
     browser: Browser, bus: FedBus, page: ServedPage
 ) -> None:
     fly(bus, 12, with_errors(OperatingError.UNDERVOLTAGE))
@@ -212,7 +212,7 @@ def test_reset_pause_and_zoom(browser: Browser, bus: FedBus, page: ServedPage) -
     assert browser.run("live.view().range()") == [-300, 0]
 
 
-def test_a_limit_colours_the_figure_and_sounds_once(
+def test_limit_colours_the_figure_and_sounds_once(
     browser: Browser, bus: FedBus, page: ServedPage
 ) -> None:
     fly(bus, 10)
@@ -283,7 +283,7 @@ def test_large_values_stay_within_their_figure(
         assert browser.run(outside) == []
 
 
-def test_a_page_has_no_errors_of_the_page_before(browser: Browser) -> None:
+def test_page_has_no_errors_of_the_page_before(browser: Browser) -> None:
     with ServedPage(FedBus(["esc1"])) as page:
         browser.open(page.url, ready=READY)
         browser.run("setInterval(() => fetch('/').catch(() => {}), 1)")
@@ -404,7 +404,7 @@ def test_figures_are_announced_at_most_once_in_ten_seconds(
     assert "battery voltage" in browser.run(text)
 
 
-def test_the_token_vanishes_from_the_address(browser: Browser, bus: FedBus) -> None:
+def test_token_vanishes_from_the_address(browser: Browser, bus: FedBus) -> None:
     with ServedPage(bus, "a-token") as page:
         fly(bus, 5)
         browser.open(page.url, ready="!!document.body")
@@ -417,7 +417,7 @@ def test_the_token_vanishes_from_the_address(browser: Browser, bus: FedBus) -> N
         browser.open(page.url, ready=READY)
 
 
-def test_a_late_page_is_grey_although_messages_arrive(
+def test_late_page_is_grey_although_messages_arrive(
     browser: Browser, bus: FedBus, page: ServedPage
 ) -> None:
     """A slow connection delivers old updates at the normal rate."""
@@ -432,7 +432,7 @@ def test_a_late_page_is_grey_although_messages_arrive(
         assert browser.run(is_stale)
 
 
-def test_a_report_opens_when_it_is_made(browser: Browser, bus: FedBus, tmp_path: Path) -> None:
+def test_report_opens_when_it_is_made(browser: Browser, bus: FedBus, tmp_path: Path) -> None:
     folder = tmp_path / "captures"
     folder.mkdir()
     (folder / "flight.kcap").write_bytes(capture_bytes())
@@ -449,8 +449,6 @@ def test_a_report_opens_when_it_is_made(browser: Browser, bus: FedBus, tmp_path:
             assert browser.run("document.documentElement.scrollWidth") == width
 
 
-def test_the_flights_page_says_what_is_wrong(
-    browser: Browser, bus: FedBus, page: ServedPage
-) -> None:
+def test_flights_page_says_what_is_wrong(browser: Browser, bus: FedBus, page: ServedPage) -> None:
     browser.open(f"{page.url}/flights", ready="!/reading/.test(document.body.textContent)")
     assert "record.directory" in browser.run("document.querySelector('#problem').textContent")

@@ -21,7 +21,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_log(tmp_path_factory.mktemp("logs") / "bus.log", flight(layout_of(["esc1"]), 2))
 
 
-def test_the_address_and_its_code_are_printed_again(tmp_path: Path) -> None:
+def test_address_and_its_code_are_printed_again(tmp_path: Path) -> None:
     said = refused(1, "web", "--address", "--cache", tmp_path)
     assert said == "no page was served yet. Start it: kontronik-can-gw web"
     address = Address.stored(cache_folder(tmp_path), "192.168.4.1", 8044, False)
@@ -61,9 +61,7 @@ def test_captures_that_cannot_be_read_are_told_at_the_start(tmp_path: Path, log:
 
 
 @pytest.mark.parametrize("options", [(), ("--no-token",)])
-def test_a_log_never_contains_the_token(
-    tmp_path: Path, log: Path, options: tuple[str, ...]
-) -> None:
+def test_log_never_contains_the_token(tmp_path: Path, log: Path, options: tuple[str, ...]) -> None:
     """The token is printed on a terminal only, because others can read the journal."""
     words = ["web", str(log), "--listen", "0.0.0.0:0", "--cache", str(tmp_path), *options]
     served = LoggedProcess([*map(str, PROGRAM), *words])

@@ -17,7 +17,7 @@ FILE = Path(__file__).parents[2] / "examples/telegraf/telegraf.conf"
 CONFIGURATION: dict[str, Any] = tomllib.loads(FILE.read_text())
 
 
-def test_the_address_is_the_default_of_metrics() -> None:
+def test_address_is_the_default_of_metrics() -> None:
     listen = next(option for option in OPTIONS if getattr(option, "names", ()) == ["--listen"])
     _, port = listen.settings["default"]  # type: ignore[union-attr]
     [prometheus] = CONFIGURATION["inputs"]["prometheus"]
@@ -33,6 +33,6 @@ def test_every_field_is_a_metric() -> None:
     assert set(prometheus["fieldinclude"]) - names == set()
 
 
-def test_the_configuration_contains_no_token() -> None:
+def test_configuration_contains_no_token() -> None:
     [influx] = CONFIGURATION["outputs"]["influxdb_v2"]
     assert influx["token"].startswith("$")

@@ -50,7 +50,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return made
 
 
-def test_a_missing_interface_is_tried_at_most_each_half_second(
+def test_missing_interface_is_tried_at_most_each_half_second(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     listener = BusListener(CanConfig("pcan", "PCAN_USBBUS1"), frozenset({0x123}))

@@ -137,7 +137,7 @@ def test_old_values_are_not_shown_after_the_last_frame() -> None:
     assert esc.tracks["battery_voltage"].high is not None, "extremes stay"
 
 
-def test_the_history_has_a_value_for_each_second_with_data() -> None:
+def test_history_has_a_value_for_each_second_with_data() -> None:
     """The line is silent after 3.5 s, and the values end with the timeout of telemetry."""
     monitor = watched(ONE, flight(ONE, 6, until=3.5), 7.05)
     history = list(monitor.escs[0].tracks["battery_voltage"].history)
@@ -148,7 +148,7 @@ def test_the_history_has_a_value_for_each_second_with_data() -> None:
     assert list(monitor.escs[0].tracks["battery_voltage"].history) == [None] * HISTORY_S
 
 
-def test_a_link_is_not_lost_because_its_message_is_received_later() -> None:
+def test_link_is_not_lost_because_its_message_is_received_later() -> None:
     """An older message with the link state may be received after newer values.
 
     The next message with the link state is received a cycle later.
@@ -202,7 +202,7 @@ BA_DEF_DEF_  "GenMsgCycleTime" 20;
 """
 
 
-def test_a_users_dbc_with_other_names_and_units_shows_the_same(tmp_path: Path) -> None:
+def test_users_dbc_with_other_names_and_units_shows_the_same(tmp_path: Path) -> None:
     """The DBC also has a 29-bit id."""
     (tmp_path / "car.dbc").write_text(USERS_DBC)
     bind = {

@@ -58,7 +58,7 @@ def document(done: Done) -> dict[str, Any]:
     return found
 
 
-def test_the_monitor_has_no_code_that_sends() -> None:
+def test_monitor_has_no_code_that_sends() -> None:
     """The listener has no method that sends, and the modules call no such method."""
     assert not [name for name in dir(bus_listener.BusListener) if "send" in name]
     for module in (monitor, member, model, screen, sources, watch, bus_listener):
@@ -74,7 +74,7 @@ def test_the_monitor_has_no_code_that_sends() -> None:
         ["mqtt", "--broker", "127.0.0.1:1"],
     ],
 )
-def test_the_port_of_an_esc_is_never_opened_as_a_can_adapter(
+def test_port_of_an_esc_is_never_opened_as_a_can_adapter(
     tmp_path: Path, command: list[str]
 ) -> None:
     """Opening some adapters writes to them, and nothing may be written to an ESC."""
@@ -105,7 +105,7 @@ def test_once_shows_the_values_at_the_end_of_a_log(log: Path) -> None:
     assert found["time"].startswith("2026-09-21T")
 
 
-def test_a_capture_is_shown_with_its_own_dbc(tmp_path: Path, clock: Clock) -> None:
+def test_capture_is_shown_with_its_own_dbc(tmp_path: Path, clock: Clock) -> None:
     bench = Bench(*made(2)).live(3, 8, wild=False)
     file = written(tmp_path / "x.kcap", capture_file(bench.setup, bench.entries))
     found = document(run("monitor", file, "--once"))
@@ -131,7 +131,7 @@ def test_plain_bytes_of_a_uart_are_shown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("speed", [0.5, 4])
-def test_a_recording_is_played_in_real_time(log: Path, clock: Clock, speed: float) -> None:
+def test_recording_is_played_in_real_time(log: Path, clock: Clock, speed: float) -> None:
     late: list[float] = []
     with open_input(log) as opened:
         recording = PlayedRecording(opened, speed)
@@ -290,7 +290,7 @@ def test_once_on_a_silent_bus_knows_a_quiet_gateway_of_this_machine(
         ("missing.log", (), None),
     ],
 )
-def test_a_name_may_be_an_interface_or_a_recording(
+def test_name_may_be_an_interface_or_a_recording(
     name: str,
     words: tuple[str, ...],
     channel: str | None,
@@ -317,13 +317,13 @@ def test_a_name_may_be_an_interface_or_a_recording(
         assert done.code == 1
 
 
-def test_an_interface_is_named_once() -> None:
+def test_interface_is_named_once() -> None:
     said = refused(2, "monitor", "vcan7", "--channel", "vcan8")
     assert said == "--channel vcan8: vcan7 names the interface. Leave one out."
     assert "is for a recording" in refused(2, "monitor", "vcan7", "--speed", 2)
 
 
-def test_the_interface_of_the_command_line_overrides_the_configuration(
+def test_interface_of_the_command_line_overrides_the_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     toml = written(tmp_path / "g.toml", '[can]\nchannel = "can3"\n[[esc]]\nport = "x"\n')

@@ -159,7 +159,7 @@ def test_no_value_of_an_esc_is_shown_after_its_telemetry_is_lost() -> None:
     assert not re.search(r"\d", row.removeprefix("esc1"))
 
 
-def test_a_quiet_gateway_is_remembered_until_it_sends_again() -> None:
+def test_quiet_gateway_is_remembered_until_it_sends_again() -> None:
     bus = bus_of(1)
     monitor = Monitor(bus)
     monitor.advance(0)
@@ -177,7 +177,7 @@ def test_a_quiet_gateway_is_remembered_until_it_sends_again() -> None:
     assert monitor.document()["gateway"]["state"] == "Quiet"
 
 
-def test_a_sparkline_shows_seconds_between_the_extremes_and_gaps() -> None:
+def test_sparkline_shows_seconds_between_the_extremes_and_gaps() -> None:
     (esc,) = Monitor(bus_of(1)).escs
     track = esc.tracks["battery_voltage"]
     track.history.extend([0.0, 20.0, None, 24.0, 22.0])
@@ -199,7 +199,7 @@ def plain(lines: list[Text]) -> list[str]:
     return [line.plain for line in lines]
 
 
-def test_a_sparkline_of_several_lines_has_eight_steps_in_each() -> None:
+def test_sparkline_of_several_lines_has_eight_steps_in_each() -> None:
     (esc,) = Monitor(bus_of(1)).escs
     track = esc.tracks["battery_current"]
     track.history.extend([0.0, 7.0, 8.0, None, 15.0, 16.0, 23.0])
@@ -250,7 +250,7 @@ def places_of_labels(lines: list[str]) -> list[int]:
         ((120, 60), 5),
     ],
 )
-def test_the_histories_of_all_escs_are_shown_below_their_table(
+def test_histories_of_all_escs_are_shown_below_their_table(
     size: tuple[int, int], lines: int
 ) -> None:
     shown = texts(seen(2), size)
@@ -282,7 +282,7 @@ def test_long_names_do_not_hide_the_charge(kind: str, monkeypatch: pytest.Monkey
     assert all(name in wide for name in names)
 
 
-def test_a_name_is_shortened_in_its_middle() -> None:
+def test_name_is_shortened_in_its_middle() -> None:
     assert shorten("left_front_1", 12) == "left_front_1"
     assert shorten("left_front_1", 9) == "left…nt_1"
     assert shorten("left_front_1", 6) == "lef…_1"
@@ -290,14 +290,14 @@ def test_a_name_is_shortened_in_its_middle() -> None:
     assert shorten("left_front_1", 1) == "…"
 
 
-def test_the_demo_is_shown_as_a_simulation() -> None:
+def test_demo_is_shown_as_a_simulation() -> None:
     source = DemoBus(1)
     monitor = Monitor(source.bus)
     assert "simulated ESC and faults" in texts(monitor, (80, 24), source)[0]
     assert "simulated" not in texts(seen(1), (80, 24))[0]
 
 
-def test_a_value_that_is_not_available_is_a_dash() -> None:
+def test_value_that_is_not_available_is_a_dash() -> None:
     lines = texts(seen(1, "lost"), (80, 24))
     (voltage,) = [line for line in lines if line.startswith("battery voltage")]
     value, low = voltage.split()[3:5]
@@ -306,7 +306,7 @@ def test_a_value_that_is_not_available_is_a_dash() -> None:
     assert "no errors" not in "\n".join(lines)
 
 
-def test_a_name_with_control_characters_does_not_reach_the_terminal() -> None:
+def test_name_with_control_characters_does_not_reach_the_terminal() -> None:
     source = source_of(seen(1), "can0\x1b[2J", "bad\x1b]0;x\x07 thing")
     assert "".join(texts(seen(1), (80, 24), source)).isprintable()
 
@@ -320,6 +320,6 @@ def test_a_name_with_control_characters_does_not_reach_the_terminal() -> None:
         ("replay", "REPLAY: "),
     ],
 )
-def test_a_screen_without_live_data_is_marked(kind: str, said: str) -> None:
+def test_screen_without_live_data_is_marked(kind: str, said: str) -> None:
     assert said in "\n".join(texts(seen(1, kind), (80, 24)))
     assert said not in "\n".join(texts(seen(1), (80, 24)))

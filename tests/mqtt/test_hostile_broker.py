@@ -96,7 +96,7 @@ def releases() -> Iterator[bytes]:
 
 
 @pytest.mark.parametrize("packets", [large, large_answer, qos_2, releases])
-def test_an_unexpected_packet_ends_the_connection(
+def test_unexpected_packet_ends_the_connection(
     broker: Broker,
     packets: type[Iterator[bytes]],
     monkeypatch: pytest.MonkeyPatch,

@@ -279,7 +279,7 @@ def test_silent_gateway_is_offline_after_three_seconds() -> None:
     assert set(silent.values()) == {None}
 
 
-def test_a_message_has_its_time_in_utc() -> None:
+def test_message_has_its_time_in_utc() -> None:
     assert iso(1_700_000_000_123_456_789) == "2023-11-14T22:13:20.123Z"
 
 
@@ -350,7 +350,7 @@ def check_component(key: str, component: dict[str, Any], newest: dict[str, Any])
     assert (len(options) > 1) == (kind == "enum")
 
 
-def test_an_esc_is_announced_when_heard_and_again_when_identified() -> None:
+def test_esc_is_announced_when_heard_and_again_when_identified() -> None:
     bus = layout_of(["esc1"])
     columns = SignalReader(bus.layout).columns
     info = {column.key for column in columns if column.source in ("device", "firmware_main")}

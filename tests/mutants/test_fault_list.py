@@ -57,7 +57,7 @@ def test_comments_docstrings_and_line_ends_do_not_count(
     assert changed in put_in_faults.changed_python(text, "Port.read", fault)
 
 
-def test_a_comment_and_white_space_in_c_do_not_count() -> None:
+def test_comment_and_white_space_in_c_do_not_count() -> None:
     text = "static int f(int a)\n{\n    return a /* bytes */\n        + 1;\n}\n"
     fault = Fault("", "core.c: f", "return a + 1;", "return a + 2;")
     assert "return a + 2;" in put_in_faults.changed_text(text, "f", fault)
@@ -72,7 +72,7 @@ def test_a_comment_and_white_space_in_c_do_not_count() -> None:
         ("Port.read", "later", 0, "0 places have `later`"),
     ],
 )
-def test_a_fault_that_does_not_fit_names_its_place(
+def test_fault_that_does_not_fit_names_its_place(
     function: str, find: str, nth: int, problem: str
 ) -> None:
     fault = Fault("", f"port.py: {function}", find, "0", nth=nth)
@@ -111,7 +111,7 @@ def test_tests_that_fail_without_a_fault_decide_nothing(
         ("tests/plug/power_cuts.py", f"no end within {put_in_faults.LIMIT_S} s"),
     ],
 )
-def test_a_time_out_detects_a_fault_only_if_the_tests_are_quick(
+def test_time_out_detects_a_fault_only_if_the_tests_are_quick(
     test: str,
     code: int | str,
     monkeypatch: pytest.MonkeyPatch,

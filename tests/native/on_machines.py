@@ -43,7 +43,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Case, str]]:
 
 
 @pytest.mark.parametrize("compiler", MACHINES)
-def test_the_exported_core_sends_the_same_frames_on_other_machines(
+def test_exported_core_sends_the_same_frames_on_other_machines(
     cases: list[tuple[Case, str]],
     compiler: str,
 ) -> None:
@@ -52,7 +52,7 @@ def test_the_exported_core_sends_the_same_frames_on_other_machines(
         assert case.run(MACHINES[compiler], str(program)) == text
 
 
-def test_the_exported_core_sends_the_same_frames_on_a_cortex_m4(
+def test_exported_core_sends_the_same_frames_on_a_cortex_m4(
     cases: list[tuple[Case, str]],
 ) -> None:
     for case, text in cases:
@@ -93,7 +93,7 @@ def deepest(graph: str) -> int:
     ("options", "limit"),
     [(("-DKCG_LEGACY=0",), 608), (("-DKCG_DATA=64", "-DKCG_PAGED=1", "-DKCG_E2E=1"), 704)],
 )
-def test_the_core_needs_little_stack_of_a_cortex_m4(
+def test_core_needs_little_stack_of_a_cortex_m4(
     tmp_path: Path,
     options: tuple[str, ...],
     limit: int,
@@ -130,7 +130,7 @@ MEMORY = {"memcpy", "memset", "memmove", "memchr", "memcmp"}
         (shipped("dbc/kontronik_esc.dbc"), (), 8 * KB - 256, None),
     ],
 )
-def test_the_core_needs_little_flash_and_ram_of_a_cortex_m4(
+def test_core_needs_little_flash_and_ram_of_a_cortex_m4(
     tmp_path: Path,
     dbc: Path,
     options: tuple[str, ...],

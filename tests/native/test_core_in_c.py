@@ -96,7 +96,7 @@ SOURCES = {
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_a_factor_of_many_digits_gives_the_same_frames_in_c(native_library: Any, seed: int) -> None:
+def test_factor_of_many_digits_gives_the_same_frames_in_c(native_library: Any, seed: int) -> None:
     """Values are near the largest one that the core multiplies or the signal represents.
 
     The limits of the source are included.
@@ -196,7 +196,7 @@ HEAD = 'VERSION ""\nBU_: G X\nBO_ 256 M: 8 G\n'
         ("motor_run_time", "0.00012345678912345678", r"Factor (0\.00012345678\d+) fits"),
     ],
 )
-def test_a_suggested_factor_fits_and_is_almost_equal(
+def test_suggested_factor_fits_and_is_almost_equal(
     source: str,
     factor: str,
     remedy: str,
@@ -248,7 +248,7 @@ DOUBLE = 64, 2
         ("battery_current", "A", "0.12345678901234567", DOUBLE),
     ],
 )
-def test_a_float_with_a_factor_of_many_digits_gives_the_same_frames_in_c(
+def test_float_with_a_factor_of_many_digits_gives_the_same_frames_in_c(
     native_library: Any,
     source: str,
     unit: str,
@@ -279,16 +279,14 @@ def test_a_float_with_a_factor_of_many_digits_gives_the_same_frames_in_c(
         ("1e-300", SINGLE),
     ],
 )
-def test_a_float_that_needs_more_than_64_bits_is_refused(
-    factor: str, form: tuple[int, int]
-) -> None:
+def test_float_that_needs_more_than_64_bits_is_refused(factor: str, form: tuple[int, int]) -> None:
     length, code = form
     layout = compiled(HEAD + FLOAT.format(length, factor, "rad/s", code), bind={"S": "motor_speed"})
     with pytest.raises(NotInCore, match=r"exceeds 64 bits\. An integer may fit$"):
         Tables(CoreSettings([EscSettings("esc1", 7)], layout))
 
 
-def test_a_value_that_the_c_core_does_not_compute_is_refused_by_name() -> None:
+def test_value_that_the_c_core_does_not_compute_is_refused_by_name() -> None:
     """A product is not the battery's power just because it is a product."""
     power = VALUES["battery_power"]
     bec = replace(power, name="BEC power", words=VALUES["bec_voltage"].words + power.words[1:])
@@ -356,7 +354,7 @@ def _energy_object() -> SlotPlan:
     [(1 << 48) + 1, 10 * 31_557_600 * 100_000_000],
     ids=["2^48 mW s", "ten years at 100 kW"],
 )
-def test_a_large_energy_is_equal_in_both_cores_and_restarts_at_0(
+def test_large_energy_is_equal_in_both_cores_and_restarts_at_0(
     native_library: Any,
     mw_s: int,
 ) -> None:
@@ -371,7 +369,7 @@ def test_a_large_energy_is_equal_in_both_cores_and_restarts_at_0(
         assert int.from_bytes(frame.data, "little") == tenths_of_wh % (1 << 32), core.language
 
 
-def test_a_frame_at_the_end_of_a_stream_is_found_but_not_processed(native_library: Any) -> None:
+def test_frame_at_the_end_of_a_stream_is_found_but_not_processed(native_library: Any) -> None:
     """Later calls do not process it either. In this stream a shorter frame follows a header."""
     core = NativeCore(native_library, CoreSettings([EscSettings()], MessageLayout("", "", ())), 0)
     frame = encode(LiveData(battery_voltage=2400), WireLayout.LEGACY)
@@ -384,7 +382,7 @@ def test_a_frame_at_the_end_of_a_stream_is_found_but_not_processed(native_librar
 
 
 @pytest.mark.parametrize("frames", [0, 99_999_998, 150_000_000, 2**32 - 3])
-def test_the_rate_counts_at_most_100_million_frames_in_a_second(
+def test_rate_counts_at_most_100_million_frames_in_a_second(
     native_library: Any,
     frames: int,
 ) -> None:
@@ -430,7 +428,7 @@ def test_clang_compiles_every_source_without_a_warning(tmp_path: Path) -> None:
 @pytest.mark.promise("no-undefined-behaviour")
 @pytest.mark.extended
 @pytest.mark.usefixtures("c_compiler")
-def test_the_core_stays_in_its_memory_and_has_no_undefined_behaviour(tmp_path: Path) -> None:
+def test_core_stays_in_its_memory_and_has_no_undefined_behaviour(tmp_path: Path) -> None:
     script = (
         "import pathlib, sys\nimport equality, offline_equality\n"
         "from kontronik_can_gw.native.binding import load\n"
@@ -443,7 +441,7 @@ def test_the_core_stays_in_its_memory_and_has_no_undefined_behaviour(tmp_path: P
 
 
 @pytest.mark.usefixtures("c_compiler")
-def test_an_object_of_other_sources_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_object_of_other_sources_is_refused_in_one_line(tmp_path: Path) -> None:
     options = [option.replace("KCG_DATA=64", "KCG_DATA=8") for option in OPTIONS]
     with pytest.raises(WrongObject, match="built from other sources"):
         load(built(tmp_path / "small.so", *options))

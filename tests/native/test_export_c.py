@@ -24,7 +24,7 @@ pytestmark = pytest.mark.promise("firmware")
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_an_export_sends_the_frames_of_the_python_core(
+def test_export_sends_the_frames_of_the_python_core(
     c_compiler: Callable[..., str], tmp_path: Path, seed: int
 ) -> None:
     case = Case(tmp_path, seed)
@@ -49,7 +49,7 @@ def test_all_macros_compile_without_a_warning(
     Case(tmp_path, 1, bus.layout, bus.escs).build(c_compiler(program), "-Os", *options.split())
 
 
-def test_the_command_exports_the_messages_of_a_configuration(
+def test_command_exports_the_messages_of_a_configuration(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -93,7 +93,7 @@ def test_existing_files_are_only_replaced_with_force(
     assert main(["export", "c", str(tmp_path / "README.md")]) == 1
 
 
-def test_a_signal_that_the_core_cannot_express_is_refused(
+def test_signal_that_the_core_cannot_express_is_refused(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -140,7 +140,7 @@ def shipped_case(tmp_path: Path) -> Case:
     return Case(tmp_path, 1, bus.layout, bus.escs)
 
 
-def test_an_export_links_with_a_cpp_program(
+def test_export_links_with_a_cpp_program(
     c_compiler: Callable[..., str], shipped_case: Case
 ) -> None:
     case = shipped_case
@@ -253,7 +253,7 @@ LOST = LinkState.LOST
 PORT_ERROR = LinkState.PORT_ERROR
 
 
-def test_the_example_survives_a_failed_uart_and_bus_off(
+def test_example_survives_a_failed_uart_and_bus_off(
     c_compiler: Callable[..., str], shipped_case: Case
 ) -> None:
     case = shipped_case

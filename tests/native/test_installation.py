@@ -75,7 +75,7 @@ def installed(sources: Path, environment: Mapping[str, str]) -> tuple[Path, str,
     ],
     ids=["with a compiler", "without one", "with one that fails"],
 )
-def test_an_installed_gateway_works_and_logs_which_core_runs_and_why(
+def test_installed_gateway_works_and_logs_which_core_runs_and_why(
     sources: Path,
     compiles: str | None,
     why: str,

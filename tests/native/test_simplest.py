@@ -23,7 +23,7 @@ def _has_intercept(slope: Fraction, results: list[int], low: int) -> bool:
 
 
 @pytest.mark.parametrize("seed", range(300))
-def test_the_simplest_fraction_gives_the_same_integers(seed: int) -> None:
+def test_simplest_fraction_gives_the_same_integers(seed: int) -> None:
     chance = random.Random(seed)
     low = chance.randint(-30, 20)
     slope = Fraction(chance.randint(-500, 500), chance.randint(1, 300))
@@ -57,7 +57,7 @@ def _is_alike(slope: Fraction, most: int, is_single: bool, other: Fraction) -> b
 
 
 @pytest.mark.parametrize("is_single", [True, False])
-def test_the_simplest_fraction_gives_the_same_floats(is_single: bool) -> None:
+def test_simplest_fraction_gives_the_same_floats(is_single: bool) -> None:
     chance = random.Random(1)
     simpler = 0
     for _ in range(60):

@@ -296,7 +296,7 @@ class Beacon(Output):
 
 
 @pytest.mark.parametrize("queued", [True, False])
-def test_an_output_that_is_due_sends_between_turns_in_c(
+def test_output_that_is_due_sends_between_turns_in_c(
     queued: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -323,7 +323,7 @@ def test_an_output_that_is_due_sends_between_turns_in_c(
     it.loop.close()
 
 
-def test_an_emergency_on_a_full_bus_after_a_long_pause_is_sent_later(
+def test_emergency_on_a_full_bus_after_a_long_pause_is_sent_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The time without a sent frame counts only from then. It is not a stall and not a loss."""
@@ -345,7 +345,7 @@ def test_an_emergency_on_a_full_bus_after_a_long_pause_is_sent_later(
 
 
 @pytest.mark.parametrize("answer", [Sent.DOWN, Sent.GONE])
-def test_a_failed_interface_is_noticed_at_the_next_frame(
+def test_failed_interface_is_noticed_at_the_next_frame(
     answer: Sent,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -383,7 +383,7 @@ def test_sending_to_a_busy_driver_is_retried_every_two_milliseconds(
     it.loop.close()
 
 
-def test_a_slow_bus_gets_the_newest_pages_of_a_multiplexed_message(
+def test_slow_bus_gets_the_newest_pages_of_a_multiplexed_message(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A waiting group is replaced only by its newer version, and groups keep their order."""

@@ -86,7 +86,7 @@ def why(layout: MessageLayout = EMPTY, **settings: object) -> str:
         ("1", "KONTRONIK_PURE is set"),
     ],
 )
-def test_the_c_core_runs_unless_the_python_core_is_requested(
+def test_c_core_runs_unless_the_python_core_is_requested(
     monkeypatch: pytest.MonkeyPatch,
     pure: str,
     said: str,
@@ -112,7 +112,7 @@ OTHER_MACHINE = "core-other.so: built for another machine"
         (lambda whole: sealed(whole[:64] + bytes(9)), "core-other.so: "),
     ],
 )
-def test_the_python_core_runs_if_the_c_core_cannot_be_loaded(
+def test_python_core_runs_if_the_c_core_cannot_be_loaded(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     made_of: Callable[[bytes], bytes | None],
@@ -143,7 +143,7 @@ def test_the_python_core_runs_if_the_c_core_cannot_be_loaded(
         ("x86_64", 32, "i686"),
     ],
 )
-def test_a_process_of_32_bits_loads_its_own_object(
+def test_process_of_32_bits_loads_its_own_object(
     monkeypatch: pytest.MonkeyPatch,
     machine: str,
     bits: int,
@@ -155,7 +155,7 @@ def test_a_process_of_32_bits_loads_its_own_object(
 
 
 @needs_c
-def test_the_python_core_runs_if_ctypes_may_not_load(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_core_runs_if_ctypes_may_not_load(monkeypatch: pytest.MonkeyPatch) -> None:
     """On some machines a systemd unit that forbids executable memory causes this."""
     monkeypatch.setitem(sys.modules, "kontronik_can_gw.native.binding", None)
     assert why().startswith("ctypes cannot be used here: ")
@@ -210,7 +210,7 @@ def test_note_of_the_c_core_tells_that_an_output_follows_live_frames() -> None:
 
 
 @needs_c
-def test_an_object_of_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_object_of_other_fields_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """The number that an object carries covers the generated header, not only the C files."""
     header = objects.wire_header()
     monkeypatch.setattr(objects, "wire_header", lambda: header.replace("live, 4", "live, 5"))
@@ -239,7 +239,7 @@ def test_numbers_that_leave_64_bits_run_in_python(signal: str, more: str, said: 
     assert bool(said) == bool(found)
 
 
-def test_a_failing_compiler_is_reported_in_one_line(
+def test_failing_compiler_is_reported_in_one_line(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

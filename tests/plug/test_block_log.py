@@ -40,7 +40,7 @@ def record(sector: int, count: int, flags: int, data: bytes = b"", length: int =
     return (head + data).ljust(SECTOR, b"\0") if flags & 8 else head.ljust(SECTOR, b"\0") + data
 
 
-def test_a_log_of_the_kernel_is_read_up_to_its_end() -> None:
+def test_log_of_the_kernel_is_read_up_to_its_end() -> None:
     log = bytes(SECTOR)  # the head, which is written later
     log += record(8, 2, 0, A + B)
     log += record(0, 0, 8, b"now=7", 5)
@@ -95,9 +95,7 @@ def test_content_that_is_written_after_its_head_is_read_again(
         (11, 11, []),
     ],
 )
-def test_a_prefix_has_the_flushed_writes_as_its_base(
-    at: int, base: int, writes: list[Write]
-) -> None:
+def test_prefix_has_the_flushed_writes_as_its_base(at: int, base: int, writes: list[Write]) -> None:
     assert LOG.prefix(at) == State(base, at, tuple(writes))
 
 
@@ -127,14 +125,14 @@ def test_variants_lose_only_writes_that_are_not_durable() -> None:
     assert rest == {(), ((4, D),), ((5, A),), ((4, D), (5, A))}
 
 
-def test_a_durable_write_under_way_may_be_missing_and_counts_as_before_it() -> None:
+def test_durable_write_under_way_may_be_missing_and_counts_as_before_it() -> None:
     generator = random.Random(1)
     states = {LOG.variant(6, generator)[:3] for _ in range(100)}
     assert states == {(5, 5, ()), (5, 5, ((3, C),))}
 
 
 @pytest.mark.parametrize("unit", [SECTOR, 2 * SECTOR])
-def test_a_torn_write_reaches_the_device_in_whole_units(unit: int) -> None:
+def test_torn_write_reaches_the_device_in_whole_units(unit: int) -> None:
     entry = Entry(10, A + B + C + D)
     generator = random.Random(1)
     seen = {tuple(torn(entry, unit, generator)) for _ in range(500)}

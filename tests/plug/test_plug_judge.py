@@ -66,7 +66,7 @@ def judged(folder: Path, content: bytes, cut_ns: int, flushed: int = 0) -> Verdi
     ],
     ids=["whole", "shorter", "ended", "torn", "zeros", "gap", "empty", "not begun"],
 )
-def test_a_capture_that_ends_within_a_second_before_the_cut_is_good(
+def test_capture_that_ends_within_a_second_before_the_cut_is_good(
     content: bytes, cut_ns: int, blocks: int, loss_ns: int, tmp_path: Path
 ) -> None:
     verdict = judged(tmp_path, content, cut_ns, blocks)
@@ -84,14 +84,14 @@ def test_a_capture_that_ends_within_a_second_before_the_cut_is_good(
     ],
     ids=["header only", "flushed block missing", "other block", "further block", "empty"],
 )
-def test_a_capture_that_misses_or_invents_data_is_refused(
+def test_capture_that_misses_or_invents_data_is_refused(
     content: bytes, flushed: int, problem: str, tmp_path: Path
 ) -> None:
     verdict = judged(tmp_path, content, 11 * SECOND + 800 * MS, flushed)
     assert f"{NAME}: {problem}" in verdict.problems
 
 
-def test_a_reference_with_a_missing_block_is_refused(tmp_path: Path) -> None:
+def test_reference_with_a_missing_block_is_refused(tmp_path: Path) -> None:
     (tmp_path / NAME).write_bytes(WRITTEN[0] + WRITTEN[2])
     with pytest.raises(ValueError, match="a block is missing"):
         capture_of(read_blocks(tmp_path / NAME))
@@ -159,7 +159,7 @@ def test_statistics_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
     assert "statistics: [Errno" in "".join(verdict.problems)
 
 
-def test_a_start_records_in_a_new_or_an_old_folder(tmp_path: Path) -> None:
+def test_start_records_in_a_new_or_an_old_folder(tmp_path: Path) -> None:
     verdict = Verdict()
     judge_start(verdict, tmp_path / "captures")
     judge_start(verdict, tmp_path / "captures")
@@ -178,7 +178,7 @@ def fail_to_start(*_: object) -> None:
         ("put", lambda *_: None, "start: the new capture has the blocks [b'H', b'E']"),
     ],
 )
-def test_a_start_without_a_whole_capture_is_refused(
+def test_start_without_a_whole_capture_is_refused(
     name: str,
     replacement: Callable[..., None],
     problem: str,

@@ -98,7 +98,7 @@ def test_each_signal_of_an_example_is_proven(dbc: str, signals: int) -> None:
     assert len(found["proven"]) == signals
 
 
-def test_the_list_of_examples_is_complete() -> None:
+def test_list_of_examples_is_complete() -> None:
     configurations = (PROJECT / "examples").glob("*/gateway.toml")
     assert {file.parent.name for file in configurations} == {Path(dbc).parts[0] for dbc in EXAMPLES}
 
@@ -121,7 +121,7 @@ def test_each_signal_of_a_dbc_is_named_as_proven_or_not_proven(tmp_path: Path) -
     assert len(named) == len(signals)
 
 
-def test_a_dbc_with_each_kind_of_signal_is_proven_completely(tmp_path: Path) -> None:
+def test_dbc_with_each_kind_of_signal_is_proven_completely(tmp_path: Path) -> None:
     found = proof_of(configuration(tmp_path))
     assert found["refuted"] == []
     assert found["unproven"] == []
@@ -129,9 +129,7 @@ def test_a_dbc_with_each_kind_of_signal_is_proven_completely(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("name", ["my_car", "no_start_values", "kontronik_esc_0.5.0"])
-def test_a_dbc_of_the_golden_set_is_proven_except_floats_and_crcs(
-    tmp_path: Path, name: str
-) -> None:
+def test_dbc_of_the_golden_set_is_proven_except_floats_and_crcs(tmp_path: Path, name: str) -> None:
     file = PROJECT / f"tests/golden/inputs/{name}.dbc"
     text = f'[can]\nfd = true\n{ONE_ESC}[dbc]\nfile = "{file}"\nunbound = "start_value"\n'
     if name == "my_car":
@@ -144,7 +142,7 @@ def test_a_dbc_of_the_golden_set_is_proven_except_floats_and_crcs(
 
 
 @pytest.mark.parametrize("profile", ["1A", "1B", "1C", "2", "5", "11A", "11C", "22"])
-def test_an_e2e_message_is_proven_except_the_computation_of_its_crc(
+def test_e2e_message_is_proven_except_the_computation_of_its_crc(
     tmp_path: Path, profile: str
 ) -> None:
     crc_bits = 16 if profile == "5" else 8
@@ -192,7 +190,7 @@ def test_chosen_messages_without_a_transmitter_are_proven(tmp_path: Path) -> Non
     assert found["proven"] == ["EscMotor.BatteryVoltage"]
 
 
-def test_a_layout_that_only_python_can_send_is_proven_for_python(tmp_path: Path) -> None:
+def test_layout_that_only_python_can_send_is_proven_for_python(tmp_path: Path) -> None:
     found = proof_of(configuration(tmp_path, "wide.dbc"))
     assert found["refuted"] == []
     assert found["proven"] == ["LeftWide.LeftMotorRunTime", "RightWide.RightMotorRunTime"]
@@ -234,7 +232,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("each", plan_faults(), ids=lambda each: each.fault.what)
-def test_a_fault_of_the_compiler_is_refuted(each: PlanFault, copy: Path, tmp_path: Path) -> None:
+def test_fault_of_the_compiler_is_refuted(each: PlanFault, copy: Path, tmp_path: Path) -> None:
     file, changed = each.fault.put_in(copy)
     whole = file.read_text()
     file.write_text(changed)

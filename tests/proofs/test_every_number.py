@@ -113,12 +113,12 @@ def assert_one_is_refuted(proofs: list[Proof], change: Callable[[Tables], Iterat
 
 
 @pytest.mark.parametrize(("name", "field"), FIELDS)
-def test_a_wrong_number_in_a_row_is_refuted(proofs: list[Proof], name: str, field: str) -> None:
+def test_wrong_number_in_a_row_is_refuted(proofs: list[Proof], name: str, field: str) -> None:
     assert_one_is_refuted(proofs, lambda tables: changes_of_rows(tables, name, field))
 
 
 @pytest.mark.parametrize("name", ["constants", "esc_of", "listeners_of"])
-def test_a_wrong_number_in_a_list_is_refuted(proofs: list[Proof], name: str) -> None:
+def test_wrong_number_in_a_list_is_refuted(proofs: list[Proof], name: str) -> None:
     def change(tables: Tables) -> Iterator[None]:
         numbers = getattr(tables, name)
         return changes_of_list(numbers[1] if name == "listeners_of" else numbers)
@@ -127,7 +127,7 @@ def test_a_wrong_number_in_a_list_is_refuted(proofs: list[Proof], name: str) -> 
 
 
 @pytest.mark.parametrize("change", [changes_of_pages, changes_of_quiet_mode])
-def test_a_wrong_number_of_the_plan_is_refuted(
+def test_wrong_number_of_the_plan_is_refuted(
     proofs: list[Proof],
     change: Callable[[Tables], Iterator[None]],
 ) -> None:
@@ -135,7 +135,7 @@ def test_a_wrong_number_of_the_plan_is_refuted(
     assert_one_is_refuted(proofs, change)
 
 
-def test_the_lists_of_numbers_are_complete(proofs: list[Proof]) -> None:
+def test_lists_of_numbers_are_complete(proofs: list[Proof]) -> None:
     tables = proofs[0].tables
     assert tables is not None
     lists = {"constant", "esc_of", "listener", "first_listener"}

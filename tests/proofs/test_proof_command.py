@@ -61,7 +61,7 @@ def path(tmp_path: Path) -> Path:
     return written(tmp_path / "gateway.toml", f'{ESC}[dbc]\nfile = "small.dbc"\n')
 
 
-def test_the_summary_lists_what_is_not_proven_by_name(path: Path, prove: Prove) -> None:
+def test_summary_lists_what_is_not_proven_by_name(path: Path, prove: Prove) -> None:
     done = prove("-c", path)
     assert done.code == 3
     assert done.out.startswith(f"{path}: layout ")
@@ -71,7 +71,7 @@ def test_the_summary_lists_what_is_not_proven_by_name(path: Path, prove: Prove) 
     assert 'no code for "not available", which is sent as a value: Motor.BatteryC' in done.out
 
 
-def test_the_exit_code_is_0_if_each_signal_is_proven(path: Path, prove: Prove) -> None:
+def test_exit_code_is_0_if_each_signal_is_proven(path: Path, prove: Prove) -> None:
     text = DBC.replace("SIG_VALTYPE_ 256 Throttle : 1;", "")
     written(path.with_name("small.dbc"), text)
     done = prove("-c", path)
@@ -96,7 +96,7 @@ def test_json_contains_the_findings(path: Path, prove: Prove) -> None:
     }
 
 
-def test_a_wrong_plan_is_refuted_in_the_words_of_the_user(
+def test_wrong_plan_is_refuted_in_the_words_of_the_user(
     path: Path, prove: Prove, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     right = planned._python_plan
@@ -150,7 +150,7 @@ def test_no_signal_of_a_message_that_is_never_sent_is_proven(
     assert "  REFUTED   Motor: is in the DBC, but is never sent\n" in done.out
 
 
-def test_a_signal_that_the_solver_gives_up_is_listed_by_name(
+def test_signal_that_the_solver_gives_up_is_listed_by_name(
     path: Path, prove: Prove, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(z3.Solver, "check", lambda _solver: z3.unknown)
@@ -160,7 +160,7 @@ def test_a_signal_that_the_solver_gives_up_is_listed_by_name(
     assert "  not proven: Motor.MotorSpeed: the solver gave up: timeout\n" in done.out
 
 
-def test_a_removed_option_prints_the_command_that_replaces_it(path: Path) -> None:
+def test_removed_option_prints_the_command_that_replaces_it(path: Path) -> None:
     line = refused(2, "check", "--prove", path)
     assert "--prove: was removed." in line
     assert "make prove ARGS='-c /PATH/gateway.toml'" in line
@@ -180,7 +180,7 @@ def test_make_passes_a_configuration_to_this_command() -> None:
         assert f"{program} {arguments}" in done.stdout
 
 
-def test_a_dbc_that_check_refuses_is_refused_the_same_way(path: Path, prove: Prove) -> None:
+def test_dbc_that_check_refuses_is_refused_the_same_way(path: Path, prove: Prove) -> None:
     written(path.with_name("small.dbc"), DBC.replace("Throttle", "Nothing"))
     done = prove("-c", path)
     assert done.code == 2

@@ -24,20 +24,20 @@ def years_library(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return load_both(build(tmp_path_factory.mktemp("years")))
 
 
-def test_the_readme_states_the_number_of_wraps() -> None:
+def test_readme_states_the_number_of_wraps() -> None:
     page = Path(__file__).with_name("README.md").read_text(encoding="utf-8")
     assert re.findall(r"\| (\d+) wraps \|", page) == 2 * [str(len(WRAPS))]
 
 
 @pytest.mark.parametrize("wrap", WRAPS, ids=NAMES)
-def test_the_core_in_c_crosses_a_wrap_within_two_minutes(years_library: Any, wrap: Wrap) -> None:
+def test_core_in_c_crosses_a_wrap_within_two_minutes(years_library: Any, wrap: Wrap) -> None:
     run = RunInC(years_library, wrap.started_ns)
     wrap.cross(run, 60)
     assert run.oracle.numbers.frames > 40_000
 
 
 @pytest.mark.parametrize("wrap", WRAPS, ids=NAMES)
-def test_the_core_in_python_crosses_a_wrap_and_equals_the_core_in_c(
+def test_core_in_python_crosses_a_wrap_and_equals_the_core_in_c(
     years_library: Any,
     wrap: Wrap,
 ) -> None:
@@ -46,7 +46,7 @@ def test_the_core_in_python_crosses_a_wrap_and_equals_the_core_in_c(
     assert run.oracle.numbers.frames > 3_500
 
 
-def test_a_run_without_jumps_crosses_the_end_of_charge_energy_and_positions(
+def test_run_without_jumps_crosses_the_end_of_charge_energy_and_positions(
     years_library: Any,
 ) -> None:
     """An hour: the ESC's charge passes 65 535 five times, and each hour has a gap."""
@@ -56,7 +56,7 @@ def test_a_run_without_jumps_crosses_the_end_of_charge_energy_and_positions(
 
 
 @pytest.mark.parametrize("words", [["--years=0"], ["--years=1e9"], ["--processes=1"]])
-def test_a_length_out_of_range_is_refused_in_one_line(
+def test_length_out_of_range_is_refused_in_one_line(
     words: list[str],
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -131,7 +131,7 @@ def test_dense_code_is_counted() -> None:
     assert measure.code_lines == 5
 
 
-def test_an_f_string_is_one_token_in_every_version_of_python() -> None:
+def test_f_string_is_one_token_in_every_version_of_python() -> None:
     """Python 3.12 splits it into several tokens, so the figures would depend on the version."""
     measure, _ = measure_text("x = f\"{a + b} {f'{c}':>{w}}\"\ny = z\n", ".py")
     assert measure.tokens == 6

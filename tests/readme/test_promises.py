@@ -12,7 +12,7 @@ import pytest
 pytestmark = [pytest.mark.promise("one"), pytest.mark.extended]
 
 @pytest.mark.promise("two", "three")
-def test_a_thing():
+def test_thing():
     pass
 """
 
@@ -21,7 +21,7 @@ def test_each_rule_has_a_test_and_each_file_a_rule() -> None:
     assert list(list_problems(read_rules(), read_tests())) == []
 
 
-def test_the_page_is_made_from_rules_and_markers() -> None:
+def test_page_is_made_from_rules_and_markers() -> None:
     assert PAGE.read_text(encoding="utf-8") == promises_page(), "run: make docs"
 
 
@@ -30,12 +30,12 @@ def test_markers_of_files_and_of_tests_are_read() -> None:
     assert file is not None
     found = [(str(test), key) for test, key in file.markers]
     link = "* [samples/test_a.py](../samples/test_a.py)"
-    named = f"{link}:\n  `test_a_thing`"
+    named = f"{link}:\n  `test_thing`"
     assert found == [(link, "one"), (named, "two"), (named, "three")]
     assert read_markers("samples/helper.py", "def make(): pass") is None
 
 
-def test_a_missing_test_and_a_missing_rule_are_named() -> None:
+def test_missing_test_and_a_missing_rule_are_named() -> None:
     marked = read_markers("samples/test_a.py", MARKED.replace('"two", ', ""))
     bare = read_markers("samples/test_b.py", "def test_b(): pass")
     assert marked is not None
@@ -47,7 +47,7 @@ def test_a_missing_test_and_a_missing_rule_are_named() -> None:
     ]
 
 
-def test_a_rule_with_too_many_tests_or_two_groups_is_named() -> None:
+def test_rule_with_too_many_tests_or_two_groups_is_named() -> None:
     many = []
     for number in range(11):
         file = read_markers(f"tests/test_{number}.py", MARKED.replace(', "three"', ""))

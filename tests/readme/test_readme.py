@@ -39,14 +39,14 @@ CONFIGURATIONS = sorted(EXAMPLES.glob("*/gateway.toml"))
 NEEDS = {"jq": "jq"}
 
 
-def test_the_reference_matches_the_sources() -> None:
+def test_reference_matches_the_sources() -> None:
     made = {FOLDER / name: text for name, text in pages()}
     found = {path: text for path, text in PAGES.items() if path.parent == FOLDER}
     found.pop(FOLDER / "conformance.md")  # make conformance writes it
     assert made == found, "run: make docs"
 
 
-def test_the_reference_has_every_key_of_every_table() -> None:
+def test_reference_has_every_key_of_every_table() -> None:
     rows = set(re.findall(r"^\| (\w+) \|", PAGES[FOLDER / "configuration.md"], re.MULTILINE))
     tables = schema()["properties"].values()
     keys = set()
@@ -141,7 +141,7 @@ def test_check_accepts_each_example_without_a_warning(file: Path) -> None:
     ("file", "words"),
     [("bus.dbc", []), ("canopen.dbc", ["--canopen"])],
 )
-def test_the_dbc_of_an_example_is_the_output_of_the_command(file: str, words: list[str]) -> None:
+def test_dbc_of_an_example_is_the_output_of_the_command(file: str, words: list[str]) -> None:
     for dbc in EXAMPLES.glob(f"*/{file}"):
         configuration = dbc.with_name("gateway.toml")
         done = run("dbc", *words, "-c", configuration)
@@ -180,7 +180,7 @@ def given(block: Block) -> object:
 
 
 @pytest.mark.parametrize("block", [given(block) for block in blocks("")])
-def test_a_shell_block_can_be_typed_as_it_is_written(
+def test_shell_block_can_be_typed_as_it_is_written(
     block: Block,
     files: Path,
     tmp_path: Path,
@@ -214,7 +214,7 @@ def test_each_block_states_why_it_cannot_be_run() -> None:
         ([(0, "quiet"), (3, "quiet")], False),
     ],
 )
-def test_the_script_suspends_the_board_only_if_all_gateways_are_quiet(
+def test_script_suspends_the_board_only_if_all_gateways_are_quiet(
     tmp_path: Path, gateways: list[tuple[int, str]], is_suspended: bool
 ) -> None:
     if shutil.which("jq") is None:

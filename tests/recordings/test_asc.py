@@ -25,7 +25,7 @@ def _read(path: Path, *lines: str, base: str = "hex") -> list[tuple[int, CanFram
     return found
 
 
-def test_the_start_line_of_a_can_fd_measurement_is_not_a_frame(tmp_path: Path) -> None:
+def test_start_line_of_a_can_fd_measurement_is_not_a_frame(tmp_path: Path) -> None:
     path = tmp_path / "fd.asc"
     found = _read(
         path,
@@ -45,7 +45,7 @@ def test_the_start_line_of_a_can_fd_measurement_is_not_a_frame(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("base", ["hex", "dec"])
-def test_the_id_of_a_symbolic_name_is_at_the_end_of_the_line(tmp_path: Path, base: str) -> None:
+def test_id_of_a_symbolic_name_is_at_the_end_of_the_line(tmp_path: Path, base: str) -> None:
     """The id at the end is decimal in both bases. A name may look like a number, or end with x."""
     data = "00 00 00 C4 09 00 14 00" if base == "hex" else "0 0 0 196 9 0 20 0"
     tail = "  Length = 230000 BitCount = 119 ID = "
@@ -71,7 +71,7 @@ def test_the_id_of_a_symbolic_name_is_at_the_end_of_the_line(tmp_path: Path, bas
     ]
 
 
-def test_an_id_is_read_once_when_the_line_repeats_it(tmp_path: Path) -> None:
+def test_id_is_read_once_when_the_line_repeats_it(tmp_path: Path) -> None:
     tail = "  Length = 230000 BitCount = 119 ID = "
     found = _read(
         tmp_path / "ids.asc",
@@ -86,7 +86,7 @@ def test_an_id_is_read_once_when_the_line_repeats_it(tmp_path: Path) -> None:
     ]
 
 
-def test_a_request_to_send_is_not_a_second_frame(tmp_path: Path) -> None:
+def test_request_to_send_is_not_a_second_frame(tmp_path: Path) -> None:
     found = _read(
         tmp_path / "requests.asc",
         "0.010000 1  688             TxRq d 8 00 00 00 C4 09 00 14 00",

@@ -32,7 +32,7 @@ WITH_FD = sorted(set(FORMATS) - {"trc"})
 
 
 @pytest.mark.parametrize("format_", FORMATS)
-def test_a_written_log_is_read_equal_by_python_can_and_by_us(tmp_path: Path, format_: str) -> None:
+def test_written_log_is_read_equal_by_python_can_and_by_us(tmp_path: Path, format_: str) -> None:
     path = tmp_path / f"log{SUFFIX[format_]}"
     for seed in range(3 if format_ == "mf4" else 12):
         items = some_frames(100, seed, fd=format_ in WITH_FD)
@@ -46,7 +46,7 @@ def test_a_written_log_is_read_equal_by_python_can_and_by_us(tmp_path: Path, for
 
 
 @pytest.mark.parametrize("format_", FORMATS)
-def test_a_log_written_by_python_can_is_read(tmp_path: Path, format_: str) -> None:
+def test_log_written_by_python_can_is_read(tmp_path: Path, format_: str) -> None:
     items = at_wall(some_frames(300, fd=format_ in WITH_FD))
     path = tmp_path / f"log{SUFFIX[format_]}"
     with can.Logger(path) as writer:
@@ -63,7 +63,7 @@ def test_a_log_written_by_python_can_is_read(tmp_path: Path, format_: str) -> No
         assert abs(one[0] - other[0]) <= 1000
 
 
-def test_a_candump_log_of_other_tools_is_read(tmp_path: Path) -> None:
+def test_candump_log_of_other_tools_is_read(tmp_path: Path) -> None:
     path = tmp_path / "other.log"
     path.write_text(
         "(1700000000.000001) can0 681#0011\n"
@@ -115,7 +115,7 @@ def test_asc_with_decimal_base_and_relative_times_is_read(tmp_path: Path) -> Non
     ]
 
 
-def test_the_content_decides_on_the_format_and_not_the_suffix(tmp_path: Path) -> None:
+def test_content_decides_on_the_format_and_not_the_suffix(tmp_path: Path) -> None:
     for format_ in FORMATS:
         path = tmp_path / f"{format_}.bin"
         write_log(path, format_, some_frames(5))
@@ -218,7 +218,7 @@ def test_can_fd_frames_are_left_out_of_trc_with_a_warning(tmp_path: Path) -> Non
     assert found == [item[1:] for item in some if not item[1].fd]
 
 
-def test_a_part_has_all_frames_of_a_log_whose_interfaces_are_not_in_order(tmp_path: Path) -> None:
+def test_part_has_all_frames_of_a_log_whose_interfaces_are_not_in_order(tmp_path: Path) -> None:
     """The frames of the second interface are stored up to a second too late."""
     lines = []
     for ms in range(0, 6000, 5):
@@ -237,7 +237,7 @@ def test_a_part_has_all_frames_of_a_log_whose_interfaces_are_not_in_order(tmp_pa
         assert times == list(range(1000, 3001, 5))
 
 
-def test_a_direction_that_a_log_does_not_state_is_not_written(tmp_path: Path) -> None:
+def test_direction_that_a_log_does_not_state_is_not_written(tmp_path: Path) -> None:
     lines = [
         "(1700000000.000000) can0 688#000000C409001400",
         "(1700000000.001000) can0 688#000000C409001400 R",

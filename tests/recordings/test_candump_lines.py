@@ -84,7 +84,7 @@ def line_by_line(data: bytes) -> tuple[list[LogFrame], list[str]]:
 
 
 @pytest.mark.parametrize("line", [*LINES, *OTHERS])
-def test_a_line_is_read_the_same_alone_and_among_others(line: bytes) -> None:
+def test_line_is_read_the_same_alone_and_among_others(line: bytes) -> None:
     around = LINES[0] * 3, LINES[1] * 2
     data = line.join(around)
     frames, damage = read(data, always(1 << 16))

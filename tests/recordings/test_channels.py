@@ -49,7 +49,7 @@ def _voltages(log: Path, *words: object) -> set[str]:
 
 
 @pytest.mark.parametrize("format_", FORMATS)
-def test_a_channel_is_chosen_by_its_name_in_the_log(tmp_path: Path, format_: str) -> None:
+def test_channel_is_chosen_by_its_name_in_the_log(tmp_path: Path, format_: str) -> None:
     log = _in_format(tmp_path, format_)
     names = ("can0", "can1") if format_ == "candump" else ("1", "2")
     assert _voltages(log, "--channel", names[0]) == {"25.0"}
@@ -79,7 +79,7 @@ def test_a_channel_is_chosen_by_its_name_in_the_log(tmp_path: Path, format_: str
 
 
 @pytest.mark.parametrize("format_", FORMATS)
-def test_a_copy_of_a_log_keeps_the_channels(tmp_path: Path, format_: str) -> None:
+def test_copy_of_a_log_keeps_the_channels(tmp_path: Path, format_: str) -> None:
     log = _in_format(tmp_path, format_)
     if format_ != "candump":
         with READERS[format_](log) as reader:
@@ -101,7 +101,7 @@ def _names_and_frames(log: Path) -> list[list[str]]:
     return [line.split()[1:3] for line in log.read_text().splitlines()]
 
 
-def test_the_only_channel_with_messages_of_the_dbc_is_chosen(tmp_path: Path) -> None:
+def test_only_channel_with_messages_of_the_dbc_is_chosen(tmp_path: Path) -> None:
     log = _two_buses(tmp_path / "two.log")
     log.write_text(log.read_text().replace("can1 688", "can1 123"))
     assert _voltages(log) == {"25.0"}
@@ -118,7 +118,7 @@ def test_all_channels_of_the_whole_log_are_listed(tmp_path: Path) -> None:
     assert refused(2, "convert", log, tmp_path / "o.csv").endswith("--channel: can0, can1, vcan7.")
 
 
-def test_a_capture_has_no_channels(tmp_path: Path) -> None:
+def test_capture_has_no_channels(tmp_path: Path) -> None:
     bench = Bench(*made()).live(3, 0.5)
     path = tmp_path / "a.kcap"
     path.write_bytes(capture_file(bench.setup, bench.entries))

@@ -154,14 +154,14 @@ def test_ten_frames_that_go_back_by_more_than_100_ms_are_a_step(
     assert clock.impossible == 0
 
 
-def test_a_second_step_adds_to_the_first() -> None:
+def test_second_step_adds_to_the_first() -> None:
     times = [*range(1000, 1200), *range(500, 700), *range(100, 300)]
     found, clock = _read(times)
     assert found == [*range(1000, 1600)]
     assert [step.by_ns // MS for step in clock.steps] == [-700, -600]
 
 
-def test_the_gap_at_a_step_is_taken_from_the_periods_of_the_ids() -> None:
+def test_gap_at_a_step_is_taken_from_the_periods_of_the_ids() -> None:
     """Frame 0x200 is sent every 100 ms and 0x100 every 10 ms. The step is before a frame 0x200."""
     fast = [(ms, 0x100) for ms in range(0, 1000, 10)]
     slow = [(ms, 0x200) for ms in range(3, 1000, 100)]
@@ -184,7 +184,7 @@ def test_one_frame_ahead_of_the_others_is_not_a_step(ahead_ms: int) -> None:
     assert clock.impossible == (ahead_ms > 10_000)
 
 
-def test_a_jump_ahead_is_kept_and_reported(tmp_path: Path) -> None:
+def test_jump_ahead_is_kept_and_reported(tmp_path: Path) -> None:
     items = _moved(_cyclic(100), lambda time_ns: HOUR_NS * (time_ns >= 500 * MS))
     path = tmp_path / "ahead.log"
     write_log(path, "candump", items)
@@ -199,7 +199,7 @@ def test_a_jump_ahead_is_kept_and_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("by_s", "words"), [(-3600, "back by 1 h 00 min 00 s"), (7200, "ahead by 2 h 00 min 00 s")]
 )
-def test_a_clock_set_during_a_capture_is_reported(tmp_path: Path, by_s: int, words: str) -> None:
+def test_clock_set_during_a_capture_is_reported(tmp_path: Path, by_s: int, words: str) -> None:
     bench = Bench(*made()).live(3, 4)
     paths = []
     for name in ("steady", "set"):

@@ -57,7 +57,7 @@ def column(path: Path) -> list[tuple[float, str]]:
 
 
 @pytest.mark.parametrize("language", ["C", "Python"])
-def test_a_column_has_the_state_of_the_clock_in_each_row(
+def test_column_has_the_state_of_the_clock_in_each_row(
     tmp_path: Path, bench: Bench, language: str
 ) -> None:
     path = recorded(bench, tmp_path / "a.kcap", False, (2, True), (4, None), (5, False))
@@ -111,7 +111,7 @@ def test_every_command_states_when_times_were_not_reliable(
 
 
 @pytest.mark.parametrize("first", [True, None, "missing", "nonsense", {}])
-def test_a_reliable_or_unknown_clock_is_not_mentioned(
+def test_reliable_or_unknown_clock_is_not_mentioned(
     tmp_path: Path, bench: Bench, first: object
 ) -> None:
     path = recorded(bench, tmp_path / "a.kcap", first)
@@ -122,7 +122,7 @@ def test_a_reliable_or_unknown_clock_is_not_mentioned(
     assert ("UtcTrusted" in head) == (first is True)
 
 
-def test_an_old_capture_has_the_same_table_as_before(tmp_path: Path, bench: Bench) -> None:
+def test_old_capture_has_the_same_table_as_before(tmp_path: Path, bench: Bench) -> None:
     tables = []
     for first in ("missing", True):
         path = recorded(bench, tmp_path / "a.kcap", first)

@@ -51,7 +51,7 @@ def dump(tmp_path: Path) -> Path:
         "mf4-log",
     ],
 )
-def test_an_input_without_frames_is_refused_and_leaves_no_file(tmp_path: Path, form: str) -> None:
+def test_input_without_frames_is_refused_and_leaves_no_file(tmp_path: Path, form: str) -> None:
     source = tmp_path / "other.log"
     is_table = form in ("csv", "jsonl", "parquet")
     foreign_frame = "(1700000000.000000) can0 123#00\n"
@@ -70,7 +70,7 @@ def test_an_input_without_frames_is_refused_and_leaves_no_file(tmp_path: Path, f
         ("asammdf", "mf4-log", "MF4 needs asammdf>=8. "),
     ],
 )
-def test_a_missing_library_is_named_with_the_command_that_installs_it(
+def test_missing_library_is_named_with_the_command_that_installs_it(
     dump: Path,
     tmp_path: Path,
     module: str,
@@ -86,7 +86,7 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "asc", "blf", "mf4-log"])
-def test_a_full_disk_is_reported_in_one_line_and_leaves_no_file(
+def test_full_disk_is_reported_in_one_line_and_leaves_no_file(
     dump: Path,
     tmp_path: Path,
     form: str,
@@ -107,7 +107,7 @@ def test_a_full_disk_is_reported_in_one_line_and_leaves_no_file(
     ("form", "number"),
     [("csv", signal.SIGINT), ("parquet", signal.SIGTERM), ("blf", signal.SIGINT)],
 )
-def test_a_signal_leaves_no_incomplete_file(
+def test_signal_leaves_no_incomplete_file(
     tmp_path: Path,
     form: str,
     number: signal.Signals,
@@ -135,7 +135,7 @@ def test_a_signal_leaves_no_incomplete_file(
     assert [path.name for path in folder.iterdir()] == ["some.log"]
 
 
-def test_a_long_conversion_shows_its_progress_on_a_terminal(
+def test_long_conversion_shows_its_progress_on_a_terminal(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("TERM", "xterm")

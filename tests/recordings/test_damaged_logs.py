@@ -34,7 +34,7 @@ def _is_part(found: list[Item], items: list[Item]) -> bool:
 
 
 @pytest.mark.parametrize("format_", OWN)
-def test_a_cut_file_gives_all_frames_before_the_cut(tmp_path: Path, format_: str) -> None:
+def test_cut_file_gives_all_frames_before_the_cut(tmp_path: Path, format_: str) -> None:
     path, items, content = _log(tmp_path, format_, 8)
     others = content.count(b"\n") - len(items) - (format_ == "asc")
     for cut in range(len(content)):
@@ -137,7 +137,7 @@ def test_no_damage_raises_anything_but_a_user_error(tmp_path: Path, format_: str
     ],
     ids=["damaged times are left out", "a clock that was set leaves nothing out"],
 )
-def test_a_time_far_away_is_accepted_if_the_next_time_agrees(
+def test_time_far_away_is_accepted_if_the_next_time_agrees(
     tmp_path: Path,
     moved: dict[int, int],
     lost: list[int],
@@ -155,7 +155,7 @@ def test_a_time_far_away_is_accepted_if_the_next_time_agrees(
 
 
 @pytest.mark.parametrize("size", [15, 0x7FFFFFFF, 0xFFFFFFFF])
-def test_a_container_of_an_impossible_size_is_reported_as_damage(tmp_path: Path, size: int) -> None:
+def test_container_of_an_impossible_size_is_reported_as_damage(tmp_path: Path, size: int) -> None:
     """python-can reads the rest of the file as one container, and unpacks the first one in it."""
     items = at_wall(some_frames(9_000))
     path = tmp_path / "log.blf"
@@ -183,7 +183,7 @@ TRC = ";$FILEVERSION={}\n;$STARTTIME=45244.0\n;$COLUMNS=N,O,T,I,d,L,D\n{}\n"
         "2 2.0 FD 0123 Rx 9 " + "11 " * 9,
     ],
 )
-def test_a_trc_line_with_an_impossible_time_or_length_is_damaged(tmp_path: Path, line: str) -> None:
+def test_trc_line_with_an_impossible_time_or_length_is_damaged(tmp_path: Path, line: str) -> None:
     path = tmp_path / "log.trc"
     last = "3 3.0 FD 0124 Rx 15 " + "22 " * 64
     lines = f"1 1.0 DT 0123 Rx 1 11\n{line}\n{last}"

@@ -32,9 +32,7 @@ def _crossing(end_s: int, fd: bool) -> tuple[list[Item], int]:
 
 @pytest.mark.parametrize("end_s", ENDS)
 @pytest.mark.parametrize("format_", sorted(SUFFIX))
-def test_a_can_log_is_read_by_us_as_it_was_written(
-    tmp_path: Path, format_: str, end_s: int
-) -> None:
+def test_can_log_is_read_by_us_as_it_was_written(tmp_path: Path, format_: str, end_s: int) -> None:
     """python-can must agree, except about fractions of a microsecond. Its times are floats."""
     items, start_ns = _crossing(end_s, fd=format_ != "trc")
     path = tmp_path / f"log{SUFFIX[format_]}"
@@ -51,7 +49,7 @@ def test_a_can_log_is_read_by_us_as_it_was_written(
 
 @pytest.mark.parametrize("end_s", ENDS)
 @pytest.mark.parametrize("pure", ["0", "1"])
-def test_a_table_of_a_capture_has_the_right_times(
+def test_table_of_a_capture_has_the_right_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pure: str, end_s: int
 ) -> None:
     """``pure`` is 1 for the conversion in Python, and 0 for the one in C."""

@@ -35,7 +35,7 @@ def test_frames_missing_in_the_dbc_are_counted_and_a_remedy_is_named(
     ("compress", "command"),
     [(gzip.compress, "zcat"), (bz2.compress, "bzcat"), (lzma.compress, "xzcat")],
 )
-def test_a_compressed_log_gets_the_command_that_reads_it(
+def test_compressed_log_gets_the_command_that_reads_it(
     tmp_path: Path, compress: Callable[[bytes], bytes], command: str
 ) -> None:
     log = write_log(tmp_path / "bus.log", flight(layout_of(["a"]), 1))
@@ -47,7 +47,7 @@ def test_a_compressed_log_gets_the_command_that_reads_it(
         assert f"{command} {packed} | kontronik-can-gw COMMAND -" in said
 
 
-def test_a_format_may_be_given_by_its_suffix(tmp_path: Path) -> None:
+def test_format_may_be_given_by_its_suffix(tmp_path: Path) -> None:
     log = write_log(tmp_path / "bus.log", flight(layout_of(["a"]), 1))
     as_suffix = run("convert", log, "-", "--to", "log")
     assert as_suffix.code == 0
@@ -56,7 +56,7 @@ def test_a_format_may_be_given_by_its_suffix(tmp_path: Path) -> None:
     assert "o.mf4: .mf4 may be a table or a log. Type --to parquet (or csv)" in said
 
 
-def test_a_table_in_mf4_is_distinguished_from_a_log(tmp_path: Path) -> None:
+def test_table_in_mf4_is_distinguished_from_a_log(tmp_path: Path) -> None:
     table = tmp_path / "table.mf4"
     values = np.array([1.0, 2.0])
     with asammdf.MDF() as mdf:

@@ -101,7 +101,7 @@ def _time_of(line: str) -> float:
 @pytest.mark.parametrize(
     ("start", "end"), [("3.3", "9"), ("0", "0"), (None, "7.7"), ("12", None), ("8", "8.001")]
 )
-def test_a_part_of_plain_bytes_has_the_frames_of_the_whole_at_its_times(
+def test_part_of_plain_bytes_has_the_frames_of_the_whole_at_its_times(
     tmp_path: Path,
     start: str | None,
     end: str | None,

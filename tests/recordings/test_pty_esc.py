@@ -63,7 +63,7 @@ def test_unread_bytes_are_dropped_and_counted_and_never_block(esc: PtyEsc) -> No
     assert read_exactly(esc.path, 5) == b"again"
 
 
-def test_a_link_leads_to_its_terminal_and_is_removed_with_it(
+def test_link_leads_to_its_terminal_and_is_removed_with_it(
     tmp_path: Path,
 ) -> None:
     link = tmp_path / "esc1"

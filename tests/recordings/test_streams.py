@@ -138,7 +138,7 @@ def make_source(tmp_path: Path, kind: str) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["capture", "bytes", *FORMATS])
-def test_a_pipe_gives_the_table_of_the_file(tmp_path: Path, kind: str) -> None:
+def test_pipe_gives_the_table_of_the_file(tmp_path: Path, kind: str) -> None:
     source = make_source(tmp_path, kind)
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
@@ -159,7 +159,7 @@ def test_a_pipe_gives_the_table_of_the_file(tmp_path: Path, kind: str) -> None:
     ("form", "number"),
     [("csv", signal.SIGINT), ("csv", signal.SIGTERM), ("parquet", signal.SIGINT)],
 )
-def test_a_signal_ends_a_stream_and_keeps_its_rows(
+def test_signal_ends_a_stream_and_keeps_its_rows(
     tmp_path: Path,
     form: str,
     number: signal.Signals,
@@ -191,7 +191,7 @@ def _is_waiting_with_rows(target: Path) -> bool:
     return part.exists() and part.stat().st_size > 0
 
 
-def test_a_signal_before_any_row_leaves_no_file(tmp_path: Path) -> None:
+def test_signal_before_any_row_leaves_no_file(tmp_path: Path) -> None:
     line = candump_lines(tmp_path)[0]
     with started("convert", "-", "-", "--to", "candump") as process:
         send(process, line + line)
@@ -211,7 +211,7 @@ def test_a_signal_before_any_row_leaves_no_file(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["whole.log"]
 
 
-def test_an_interrupt_inside_exec_is_an_exit_code(tmp_path: Path) -> None:
+def test_interrupt_inside_exec_is_an_exit_code(tmp_path: Path) -> None:
     """Dataclasses call exec() while a module loads. After that, python -m kills itself."""
     tmp_path.joinpath("interrupted.py").write_text(
         "import runpy\n"
@@ -233,7 +233,7 @@ def _bytes_in(pipe: IO[bytes]) -> int:
     return count[0]
 
 
-def test_a_full_disk_keeps_the_rows_of_a_stream(tmp_path: Path) -> None:
+def test_full_disk_keeps_the_rows_of_a_stream(tmp_path: Path) -> None:
     lines = candump_lines(tmp_path)
     target = tmp_path / "out.csv"
     expected = rows_of(tmp_path / "whole.log")
@@ -291,7 +291,7 @@ def test_devices_are_refused_and_not_opened(
 
 
 @pytest.mark.parametrize("content", [b"", b"\n \n", b"neither of them\n"])
-def test_a_pipe_without_a_recording_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_pipe_without_a_recording_is_refused(tmp_path: Path, content: bytes) -> None:
     with started("convert", "-", tmp_path / "out.csv") as process:
         send(process, content)
         code, messages = ended(process)
@@ -300,7 +300,7 @@ def test_a_pipe_without_a_recording_is_refused(tmp_path: Path, content: bytes) -
     assert f"standard input: {reason}" in messages
 
 
-def test_a_spooled_capture_is_called_standard_input(tmp_path: Path) -> None:
+def test_spooled_capture_is_called_standard_input(tmp_path: Path) -> None:
     with started("convert", "-", tmp_path / "out.csv") as process:
         send(process, b"KCB1" * 30)
         code, messages = ended(process)
@@ -309,7 +309,7 @@ def test_a_spooled_capture_is_called_standard_input(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["bytes", "candump", "blf"])
-def test_a_page_of_a_pipe_has_the_data_of_the_file(tmp_path: Path, kind: str) -> None:
+def test_page_of_a_pipe_has_the_data_of_the_file(tmp_path: Path, kind: str) -> None:
     source = make_source(tmp_path, kind)
     with started("report", "-", "-o", tmp_path / "pipe.html") as process:
         send(process, source.read_bytes())
@@ -323,7 +323,7 @@ def test_a_page_of_a_pipe_has_the_data_of_the_file(tmp_path: Path, kind: str) ->
     assert data_of_pipe == data_of_file
 
 
-def test_the_monitor_shows_a_stream_before_it_ends(tmp_path: Path) -> None:
+def test_monitor_shows_a_stream_before_it_ends(tmp_path: Path) -> None:
     """After the last frame the values expire, although the stream has not ended."""
     with started("monitor", "-") as process:
         send(process, b"".join(candump_lines(tmp_path)))
@@ -361,7 +361,7 @@ def piped() -> Iterator[tuple[Stream, Callable[[bytes], int]]]:
         os.close(writes)
 
 
-def test_a_read_returns_the_waiting_bytes_and_reports_each_wait() -> None:
+def test_read_returns_the_waiting_bytes_and_reports_each_wait() -> None:
     waits: list[str] = []
     with piped() as (stream, write):
         reader = StreamReader(stream)
@@ -381,7 +381,7 @@ def test_a_read_returns_the_waiting_bytes_and_reports_each_wait() -> None:
         assert waits == ["wait"]
 
 
-def test_an_ended_stream_gives_the_rest_of_the_pipe_without_a_cut_line() -> None:
+def test_ended_stream_gives_the_rest_of_the_pipe_without_a_cut_line() -> None:
     with piped() as (stream, write):
         reader = StreamReader(stream)
         write(b"first\nsecond\nthi")
@@ -390,13 +390,13 @@ def test_an_ended_stream_gives_the_rest_of_the_pipe_without_a_cut_line() -> None
         assert reader.read() == b""
 
 
-def test_a_waiting_read_is_ended() -> None:
+def test_waiting_read_is_ended() -> None:
     with piped() as (stream, _):
         stream.before_wait = stream.end
         assert StreamReader(stream).read1(10) == b""
 
 
-def test_the_inspected_head_is_read_again() -> None:
+def test_inspected_head_is_read_again() -> None:
     with piped() as (stream, write):
         write(b"head")
         assert stream.look()

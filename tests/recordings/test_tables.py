@@ -116,7 +116,7 @@ def test_units_stand_in_headers_and_metadata(tmp_path: Path) -> None:
     assert json.loads(schema.metadata[b"kontronik_can_gw"]) == provenance
 
 
-def test_an_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_path: Path) -> None:
+def test_mf4_header_names_devices_that_the_capture_learnt_of_on_the_way(tmp_path: Path) -> None:
     source = tmp_path / "learnt.kcap"
     source.write_bytes(capture_bytes(devices=("KOSMIK",)))
     assert convert(source, tmp_path / "out.mf4", "--to", "mf4-log") == 0
@@ -182,7 +182,7 @@ def test_any_values_read_back_equal(
 
 @pytest.mark.parametrize("kept", [2, 1024])
 @pytest.mark.parametrize("form", ["csv", "jsonl"])
-def test_a_row_has_the_same_text_alone_and_among_others(
+def test_row_has_the_same_text_alone_and_among_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str, kept: int
 ) -> None:
     """Texts are kept by value, and -0.0 is equal to 0.0."""
@@ -222,7 +222,7 @@ def test_every_signal_of_the_shipped_dbc_still_names_its_column(count: int) -> N
         ]
 
 
-def test_the_age_of_an_esc_that_is_lost_goes_on_in_the_rows_of_another() -> None:
+def test_age_of_an_esc_that_is_lost_goes_on_in_the_rows_of_another() -> None:
     escs = [EscStream(EscSettings(name), 0) for name in ("a", "b")]
     fields = fields_of_values([esc.settings for esc in escs])
     ages = [index for index, one in enumerate(fields) if one.source == "data_age"]

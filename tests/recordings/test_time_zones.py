@@ -25,7 +25,7 @@ def test_local_time_is_not_utc() -> None:
 @pytest.mark.parametrize(
     ("suffix", "read"), [(".csv", read_csv), (".jsonl", read_jsonl), (".parquet", read_parquet)]
 )
-def test_a_table_has_utc(tmp_path: Path, suffix: str, read: Callable[[Path], Cells]) -> None:
+def test_table_has_utc(tmp_path: Path, suffix: str, read: Callable[[Path], Cells]) -> None:
     source = tmp_path / "flight.kcap"
     target = tmp_path / f"flight{suffix}"
     source.write_bytes(capture_bytes(1, seconds=1.0))
@@ -41,7 +41,7 @@ def test_a_table_has_utc(tmp_path: Path, suffix: str, read: Callable[[Path], Cel
 
 
 @pytest.mark.parametrize("format_", sorted(READERS))
-def test_a_log_has_the_same_unix_times_for_us_and_for_python_can(
+def test_log_has_the_same_unix_times_for_us_and_for_python_can(
     tmp_path: Path, format_: str
 ) -> None:
     path = tmp_path / f"log{SUFFIX[format_]}"
@@ -59,7 +59,7 @@ def test_a_log_has_the_same_unix_times_for_us_and_for_python_can(
         assert rest == expected
 
 
-def test_the_head_of_asc_is_local_time_and_that_of_trc_is_utc(tmp_path: Path) -> None:
+def test_head_of_asc_is_local_time_and_that_of_trc_is_utc(tmp_path: Path) -> None:
     write_log(tmp_path / "log.asc", "asc", some_frames(1), WALL_NS)
     head = (tmp_path / "log.asc").read_text().splitlines()
     assert head[0] == "date Wed Nov 15 03:43:20.250 2023"

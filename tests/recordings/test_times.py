@@ -151,7 +151,7 @@ def test_unix_times_in_an_asc_log_are_the_time_of_day(tmp_path: Path) -> None:
         [0, 20, 39],
     ],
 )
-def test_an_unordered_mf4_log_is_read_in_order(tmp_path: Path, moved: list[int]) -> None:
+def test_unordered_mf4_log_is_read_in_order(tmp_path: Path, moved: list[int]) -> None:
     """``moved`` has the numbers of frames that are stored before earlier frames."""
     times = tuple(range(0, 400, 10))
     rest = [ms for n, ms in enumerate(times) if n not in moved]
@@ -163,11 +163,11 @@ def test_an_unordered_mf4_log_is_read_in_order(tmp_path: Path, moved: list[int])
     _check(log, tuple(sorted(stored)))
 
 
-def test_an_mf4_log_without_a_date_has_no_time_of_day(tmp_path: Path) -> None:
+def test_mf4_log_without_a_date_has_no_time_of_day(tmp_path: Path) -> None:
     _check(_mf4(tmp_path / "log.mf4", TIMES_MS, 0), TIMES_MS, None)
 
 
-def test_an_asc_log_unordered_at_its_start_keeps_all_times(tmp_path: Path) -> None:
+def test_asc_log_unordered_at_its_start_keeps_all_times(tmp_path: Path) -> None:
     log = _asc(tmp_path / "order.asc", (5, 0, 10, 20))
     assert run("convert", log, tmp_path / "copy.asc").code == 0
     with opened(tmp_path / "copy.asc") as copy:

@@ -100,7 +100,7 @@ def with_computed(data: pd.DataFrame, source: str) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize("esc", [0, 1])
-def test_the_numbers_equal_those_computed_by_pandas(
+def test_numbers_equal_those_computed_by_pandas(
     bus: BusLayout,
     rows: list[Row],
     flight: Flight,
@@ -198,7 +198,7 @@ def test_losses_are_gaps_in_lines_and_events(
         assert all(v is None for v in inside[5:-5])
 
 
-def test_the_peak_power_of_a_log_is_computed_from_voltage_and_current(tmp_path: Path) -> None:
+def test_peak_power_of_a_log_is_computed_from_voltage_and_current(tmp_path: Path) -> None:
     """The shipped DBC sends power every 100 ms, voltage and current with each telemetry frame."""
     bus = layout_of(["esc1"])
     times = range(0, S, S // 100)

@@ -214,7 +214,7 @@ def test_in_a_gap_the_cursor_has_no_values(browser: Browser, pages: dict[str, Pa
         assert all((text != "–") == is_known for text in shown), (seconds, shown)
 
 
-def test_a_drag_zooms_all_plots_and_a_click_on_an_event_jumps_to_it(
+def test_drag_zooms_all_plots_and_a_click_on_an_event_jumps_to_it(
     browser: Browser, pages: dict[str, Path]
 ) -> None:
     browser.open(pages["one"])

@@ -53,7 +53,7 @@ class Tags(HTMLParser):
             self.text += data
 
 
-def test_the_page_loads_nothing_and_its_policy_lists_its_scripts(flight: Flight) -> None:
+def test_page_loads_nothing_and_its_policy_lists_its_scripts(flight: Flight) -> None:
     html = render(flight, source="y")
     tags = Tags(html)
     for tag, attributes in tags.found:
@@ -94,7 +94,7 @@ def test_all_text_of_the_input_is_escaped(flight: Flight) -> None:
     assert names[names.index("title") + 1] == "style"
 
 
-def test_the_data_of_the_page_equal_the_lines(flight: Flight) -> None:
+def test_data_of_the_page_equal_the_lines(flight: Flight) -> None:
     found = data_of(render(flight, source="y"))
     times = [time_ns - flight.origin_ns for time_ns in flight.points.times]
     assert found["times"] == [round(time_ns / S, 6) for time_ns in times]
@@ -156,7 +156,7 @@ def test_noisy_curves_of_two_escs_do_not_cover_each_other() -> None:
         assert escs[f"{key}-1"] == [1]
 
 
-def test_a_gap_of_years_is_cut_out_and_noted() -> None:
+def test_gap_of_years_is_cut_out_and_noted() -> None:
     """A board without a battery for its clock records, and its time is set meanwhile."""
     bus = layout_of(["esc1"])
     jump = 53 * 365 * 86_400 * S
@@ -182,7 +182,7 @@ def times_with_a_jump(jump_ns: int) -> list[int]:
     return even[:100] + [time_ns + jump_ns for time_ns in even[100:]]
 
 
-def test_a_part_after_a_gap_of_years_starts_at_its_own_time_of_day() -> None:
+def test_part_after_a_gap_of_years_starts_at_its_own_time_of_day() -> None:
     bus = layout_of(["esc1"])
     times = times_with_a_jump(400 * 86_400 * S)
     fields = fields_of_log(SignalReader(bus.layout), bus.escs)

@@ -24,7 +24,7 @@ def dump(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_a_page_is_written_for_a_file(dump: Path, tmp_path: Path) -> None:
+def test_page_is_written_for_a_file(dump: Path, tmp_path: Path) -> None:
     page = tmp_path / "flight.html"
     assert run("report", dump, "-o", page) == (0, b"", f"kontronik-can-gw: {page} written\n")
     html = page.read_text(encoding="utf-8")
@@ -37,7 +37,7 @@ def test_a_page_is_written_for_a_file(dump: Path, tmp_path: Path) -> None:
     assert again.read_bytes() == page.read_bytes()
 
 
-def test_the_page_of_a_part_can_be_written_to_standard_output(dump: Path) -> None:
+def test_page_of_a_part_can_be_written_to_standard_output(dump: Path) -> None:
     part = dump.with_name("part <1>")
     part.write_bytes(dump.read_bytes())
     done = run("report", part, "-o", "-", "--from", 5, "--until", 15)

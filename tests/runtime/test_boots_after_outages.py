@@ -93,7 +93,7 @@ class Outage(Bench):
     ],
 )
 @pytest.mark.parametrize("phase_ms", range(0, 1000, 100))
-def test_a_node_boots_once_and_its_boot_up_is_its_first_frame(
+def test_node_boots_once_and_its_boot_up_is_its_first_frame(
     kernel: Kernel,  # noqa: F811
     cause: str,
     behaviour: int,
@@ -126,7 +126,7 @@ def test_no_heartbeat_follows_an_outage_if_1017h_is_0(
 
 
 @in_both_cores
-def test_a_boot_up_that_was_lost_with_the_interface_is_repeated(
+def test_boot_up_that_was_lost_with_the_interface_is_repeated(
     kernel: Kernel,  # noqa: F811
 ) -> None:
     bench = Outage(kernel, behaviour=0)
@@ -146,7 +146,7 @@ def test_a_boot_up_that_was_lost_with_the_interface_is_repeated(
 
 
 @in_both_cores
-def test_a_boot_up_that_is_held_up_by_the_bus_is_not_repeated(
+def test_boot_up_that_is_held_up_by_the_bus_is_not_repeated(
     kernel: Kernel,  # noqa: F811
 ) -> None:
     bench = Outage(kernel, behaviour=0)

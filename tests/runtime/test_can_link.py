@@ -217,7 +217,7 @@ def boot_ups_and_emergencies(frames: list[tuple[int, bytes]]) -> list[str]:
 
 @pytest.mark.promise("bus-off")
 @pytest.mark.parametrize("late_ms", [0, 1, 40, 300])
-def test_a_node_boots_and_sends_8140h_when_the_queue_runs_after_a_restart(
+def test_node_boots_and_sends_8140h_when_the_queue_runs_after_a_restart(
     bench: Bench,
     kernel: Kernel,
     late_ms: int,
@@ -244,7 +244,7 @@ def test_a_node_boots_and_sends_8140h_when_the_queue_runs_after_a_restart(
     assert bench.gateway.status.bus_off_count == 1
 
 
-def test_a_driver_that_reports_bus_off_late_causes_one_boot_up(
+def test_driver_that_reports_bus_off_late_causes_one_boot_up(
     bench: Bench,
     kernel: Kernel,
 ) -> None:
@@ -259,7 +259,7 @@ def test_a_driver_that_reports_bus_off_late_causes_one_boot_up(
     assert boot_ups_and_emergencies(bench.take()) == ["boot-up", "8140", "0000"]
 
 
-def test_a_controller_without_restart_is_reported_once_with_the_remedy(
+def test_controller_without_restart_is_reported_once_with_the_remedy(
     bench: Bench,
     kernel: Kernel,
     caplog: pytest.LogCaptureFixture,
@@ -275,7 +275,7 @@ def test_a_controller_without_restart_is_reported_once_with_the_remedy(
     assert sum("restart-ms is 0" in line for line in caplog.messages) == 1
 
 
-def test_an_old_report_of_a_link_does_not_close_a_new_port(bench: Bench, kernel: Kernel) -> None:
+def test_old_report_of_a_link_does_not_close_a_new_port(bench: Bench, kernel: Kernel) -> None:
     bench.begin()
     bench.changes(LinkFacts(exists=False), there=False)
     bench.turn(100)
@@ -300,7 +300,7 @@ def test_own_frames_returned_after_an_outage_are_no_conflict(bench: Bench) -> No
     assert bench.gateway.status.id_conflicts == 1
 
 
-def test_an_outage_is_logged_with_the_remedy_and_when_it_ends(
+def test_outage_is_logged_with_the_remedy_and_when_it_ends(
     bench: Bench,
     kernel: Kernel,
     caplog: pytest.LogCaptureFixture,
@@ -327,7 +327,7 @@ def test_an_outage_is_logged_with_the_remedy_and_when_it_ends(
 
 
 @pytest.mark.promise("late-frames")
-def test_a_bus_that_was_stalled_gets_no_backlog(
+def test_bus_that_was_stalled_gets_no_backlog(
     bench: Bench,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -357,7 +357,7 @@ def test_a_bus_that_was_stalled_gets_no_backlog(
     assert "CAN can0: frames are sent again, after 4.0 s" in caplog.messages
 
 
-def test_a_saturated_bus_is_not_taken_for_a_dead_adapter(
+def test_saturated_bus_is_not_taken_for_a_dead_adapter(
     bench: Bench,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -408,7 +408,7 @@ def test_changed_receive_ids_are_set_on_the_open_port(bench: Bench) -> None:
 
 
 @pytest.mark.promise("interface-reopens")
-def test_an_adapter_that_fails_while_it_is_read_is_opened_again(bench: Bench) -> None:
+def test_adapter_that_fails_while_it_is_read_is_opened_again(bench: Bench) -> None:
     bench.start()
     bench.turn(100)
     before = bench.port
@@ -481,7 +481,7 @@ def test_no_frame_is_sent_in_bus_off(
 
 
 @pytest.mark.parametrize("told_by", ["state of no controller", "nothing", "no rtnetlink"])
-def test_a_forged_bus_off_on_a_virtual_bus_ends_after_a_second(
+def test_forged_bus_off_on_a_virtual_bus_ends_after_a_second(
     kernel: Kernel,
     monkeypatch: pytest.MonkeyPatch,
     told_by: str,
@@ -504,7 +504,7 @@ def test_a_forged_bus_off_on_a_virtual_bus_ends_after_a_second(
     made.can.close()
 
 
-def test_a_gateway_without_nodes_receives_the_same_ids_after_an_outage(kernel: Kernel) -> None:
+def test_gateway_without_nodes_receives_the_same_ids_after_an_outage(kernel: Kernel) -> None:
     """After the outage, other devices that send its messages are still noticed."""
     bench = Bench(kernel, has_node=False)
     bench.begin()
@@ -522,7 +522,7 @@ def test_a_gateway_without_nodes_receives_the_same_ids_after_an_outage(kernel: K
 
 @pytest.mark.promise("one-device")
 @pytest.mark.parametrize("wait", [False, True])
-def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
+def test_port_of_an_esc_is_never_opened_as_a_can_interface(
     bench: Bench,
     wait: bool,
     monkeypatch: pytest.MonkeyPatch,
@@ -543,7 +543,7 @@ def test_the_port_of_an_esc_is_never_opened_as_a_can_interface(
     assert opened == []
 
 
-def test_a_node_boots_when_an_adapter_unplugged_in_bus_off_is_back(
+def test_node_boots_when_an_adapter_unplugged_in_bus_off_is_back(
     bench: Bench,
 ) -> None:
     """The bus-off ended with the old adapter, so it does not suppress the boot-up."""
@@ -590,7 +590,7 @@ def test_frames_discarded_in_an_outage_are_reported_to_the_recorder(
     assert told_at == []
 
 
-def test_an_adapter_with_rare_failures_is_opened_after_the_shortest_pause(
+def test_adapter_with_rare_failures_is_opened_after_the_shortest_pause(
     bench: Bench,
 ) -> None:
     """The adapter's return is not reported. Pauses grow only while no frame can be sent."""

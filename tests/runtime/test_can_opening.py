@@ -177,7 +177,7 @@ def test_ports_are_served_while_a_driver_opens_and_frames_follow(
     assert driver.closed_by == ["can-opener"]
 
 
-def test_a_driver_that_takes_long_to_close_does_not_hold_up_the_end(
+def test_driver_that_takes_long_to_close_does_not_hold_up_the_end(
     uart: tuple[int, str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -193,7 +193,7 @@ def test_a_driver_that_takes_long_to_close_does_not_hold_up_the_end(
     assert driver.closed_by == ["can-opener"]
 
 
-def test_a_driver_that_fails_at_start_ends_a_loop_that_may_not_wait(
+def test_driver_that_fails_at_start_ends_a_loop_that_may_not_wait(
     uart: tuple[int, str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -215,7 +215,7 @@ def test_a_driver_that_fails_at_start_ends_a_loop_that_may_not_wait(
 
 
 @pytest.mark.promise("interface-reopens")
-def test_a_lost_driver_is_closed_beside_the_loop_and_opened_again(
+def test_lost_driver_is_closed_beside_the_loop_and_opened_again(
     uart: tuple[int, str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -237,7 +237,7 @@ def test_a_lost_driver_is_closed_beside_the_loop_and_opened_again(
     it.loop.end()
 
 
-def test_a_port_that_opens_after_the_end_is_closed(
+def test_port_that_opens_after_the_end_is_closed(
     uart: tuple[int, str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -253,7 +253,7 @@ def test_a_port_that_opens_after_the_end_is_closed(
 
 
 @pytest.mark.parametrize("error", [None, RunError("CAN slcan /dev/none: there is none.")])
-def test_a_driver_that_does_not_return_from_opening_is_logged(
+def test_driver_that_does_not_return_from_opening_is_logged(
     error: RunError | None,
     uart: tuple[int, str],
     monkeypatch: pytest.MonkeyPatch,

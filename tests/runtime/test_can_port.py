@@ -147,7 +147,7 @@ def filters_of(fake: FakeSocket) -> list[tuple[int, int]]:
     return list(struct.iter_unpack("=II", packed))
 
 
-def test_a_new_socket_receives_neither_data_frames_nor_its_own_frames(
+def test_new_socket_receives_neither_data_frames_nor_its_own_frames(
     port: CanPort,
     fake: FakeSocket,
 ) -> None:
@@ -212,7 +212,7 @@ def test_only_data_frames_with_wanted_ids_are_received(port: CanPort, fake: Fake
     assert port.state is CanState.BUS_OFF
 
 
-def test_a_port_is_drained_when_nothing_waits(port: CanPort, fake: FakeSocket) -> None:
+def test_port_is_drained_when_nothing_waits(port: CanPort, fake: FakeSocket) -> None:
     port.set_receive_ids({1})
     fake.inbox = [packet(1), packet(ERROR | 0x04, b"\0\x10")] * RECEIVE_LIMIT
     found = [(len(port.receive()), port.drained) for _ in range(3)]
@@ -223,7 +223,7 @@ def test_a_port_is_drained_when_nothing_waits(port: CanPort, fake: FakeSocket) -
     "number",
     [errno.ENETDOWN, errno.ENODEV, errno.EIO],
 )
-def test_an_error_does_not_end_reception(port: CanPort, fake: FakeSocket, number: int) -> None:
+def test_error_does_not_end_reception(port: CanPort, fake: FakeSocket, number: int) -> None:
     port.set_receive_ids({1})
     fake.inbox = [packet(1, b"a"), number, packet(1, b"b")]
     assert frames_of(port) == [CanFrame(1, b"a")]
@@ -261,7 +261,7 @@ def test_frames_are_sent_in_the_format_of_the_kernel(port: CanPort, fake: FakeSo
         ([errno.EBADF], Sent.GONE, CanState.DOWN),
     ],
 )
-def test_an_error_of_the_kernel_shows_the_state_of_the_interface(
+def test_error_of_the_kernel_shows_the_state_of_the_interface(
     port: CanPort,
     fake: FakeSocket,
     faults: list[int],
@@ -312,7 +312,7 @@ def test_error_frames_show_the_controllers_state_and_never_block_the_loop(
         ([], None),
     ],
 )
-def test_the_kernels_time_of_a_frame_is_converted_to_the_monotonic_clock(
+def test_kernels_time_of_a_frame_is_converted_to_the_monotonic_clock(
     port: CanPort,
     fake: FakeSocket,
     monkeypatch: pytest.MonkeyPatch,
@@ -364,7 +364,7 @@ def opened(fake: FakeSocket, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     return fake
 
 
-def test_an_interface_is_opened_with_error_frames_and_can_fd_if_asked(
+def test_interface_is_opened_with_error_frames_and_can_fd_if_asked(
     opened: FakeSocket,
     tmp_path: Path,
 ) -> None:
@@ -378,7 +378,7 @@ def test_an_interface_is_opened_with_error_frames_and_can_fd_if_asked(
     assert opened.options[socket.CAN_RAW_FD_FRAMES] == 1
 
 
-def test_an_interface_that_cannot_be_used_leaves_no_socket_open(
+def test_interface_that_cannot_be_used_leaves_no_socket_open(
     opened: FakeSocket,
     tmp_path: Path,
 ) -> None:
@@ -432,7 +432,7 @@ class DatagramSocket(socket.socket):
 
 
 @pytest.mark.promise("six-frames")
-def test_the_kernel_holds_at_most_six_frames() -> None:
+def test_kernel_holds_at_most_six_frames() -> None:
     """Newer values cannot overtake frames that wait in the kernel."""
     ours, others = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with others, DatagramSocket(fileno=ours.detach()) as mine:
@@ -484,7 +484,7 @@ def message(can_id: int, data: bytes = b"", **flags: Any) -> can.Message:
     return can.Message(arbitration_id=can_id, data=data, **flags)
 
 
-def test_a_python_can_interface_that_refuses_a_frame_is_busy() -> None:
+def test_python_can_interface_that_refuses_a_frame_is_busy() -> None:
     class Refusing:
         def send(self, _message: can.Message, timeout: float) -> None:
             assert timeout == 0
@@ -538,7 +538,7 @@ def test_frames_that_the_interface_returns_are_not_received() -> None:
         port.close()
 
 
-def test_an_identical_frame_of_another_device_is_received() -> None:
+def test_identical_frame_of_another_device_is_received() -> None:
     own_frames = OwnFrames()
     frame = CanFrame(0x680, b"same")
     own_frames.add(frame, 0)
@@ -603,7 +603,7 @@ def test_one_thread_delivers_the_wanted_frames_in_order() -> None:
         assert receive(port, 1) == [CanFrame(0x603, b"")]
 
 
-def test_the_threads_queue_is_bounded_and_keeps_the_oldest_frames() -> None:
+def test_threads_queue_is_bounded_and_keeps_the_oldest_frames() -> None:
     with virtual() as (port, other):
         port.set_receive_ids({1})
         for n in range(QUEUE_LENGTH + 20):
@@ -625,7 +625,7 @@ def test_the_threads_queue_is_bounded_and_keeps_the_oldest_frames() -> None:
     "error",
     [can.CanOperationError("unplugged"), OSError(errno.EIO, "I/O"), TypeError("closed")],
 )
-def test_an_adapter_that_fails_is_reported_as_gone(
+def test_adapter_that_fails_is_reported_as_gone(
     monkeypatch: pytest.MonkeyPatch,
     error: Exception,
 ) -> None:

@@ -73,14 +73,14 @@ class World:
         (None, None, None),
     ],
 )
-def test_the_kernels_largest_error_decides_if_the_clock_is_synchronised(
+def test_kernels_largest_error_decides_if_the_clock_is_synchronised(
     error: int | None, is_synchronized: bool | None, max_error_s: float | None
 ) -> None:
     facts = World(error).watch.facts
     assert facts == ClockFacts(is_synchronized, max_error_s, "rtc-ds3231")
 
 
-def test_a_step_has_its_size_and_the_time_after_it() -> None:
+def test_step_has_its_size_and_the_time_after_it() -> None:
     world = World()
     assert world.watch.poll(1 * SECOND) is None
     world.set_by(-3600 * SECOND)
@@ -114,7 +114,7 @@ def test_this_kernel_reports_the_error_and_has_the_timer() -> None:
     timer.close()
 
 
-def test_the_first_hardware_clock_is_found(tmp_path: Path) -> None:
+def test_first_hardware_clock_is_found(tmp_path: Path) -> None:
     assert hardware_clock(tmp_path / "none") == ""
     assert hardware_clock(tmp_path) == ""
     for name, text in (("rtc1", "rtc-pcf8523 1-0068\n"), ("rtc0", "rtc-ds3231\n")):
@@ -163,7 +163,7 @@ def test_status_and_metrics_have_the_state_of_the_clock(
     assert found == {"clock_steps_total": 0} | metrics
 
 
-def test_a_document_without_a_clock_is_still_shown() -> None:
+def test_document_without_a_clock_is_still_shown() -> None:
     bench = Bench()
     document = bench.document()
     del document["clock"]
@@ -200,7 +200,7 @@ def recorded(folder: Path, *states: ClockFacts) -> tuple[list[dict[str, object]]
     return headers, flags
 
 
-def test_a_capture_has_the_state_at_its_beginning_and_each_change(tmp_path: Path) -> None:
+def test_capture_has_the_state_at_its_beginning_and_each_change(tmp_path: Path) -> None:
     without = ClockFacts(False, None, "")
     synchronised = ClockFacts(True, 0.01, "", 1, UNIX_NS, SECOND)
     headers, flags = recorded(
@@ -217,7 +217,7 @@ def test_a_capture_has_the_state_at_its_beginning_and_each_change(tmp_path: Path
     assert flags == [CLOCK_FLAGS[True], CLOCK_FLAGS[None], CLOCK_FLAGS[False]]
 
 
-def test_a_step_of_a_synchronised_clock_is_recorded_at_once(tmp_path: Path) -> None:
+def test_step_of_a_synchronised_clock_is_recorded_at_once(tmp_path: Path) -> None:
     before = ClockFacts(True)
     _, flags = recorded(tmp_path, before, before, before._replace(steps=1))
     assert flags == [CLOCK_FLAGS[True]]

@@ -20,7 +20,7 @@ def told(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
     return caplog
 
 
-def test_a_condition_is_logged_when_it_begins_and_when_it_ends(
+def test_condition_is_logged_when_it_begins_and_when_it_ends(
     told: pytest.LogCaptureFixture,
 ) -> None:
     conditions = FaultLog()
@@ -36,7 +36,7 @@ def test_a_condition_is_logged_when_it_begins_and_when_it_ends(
     assert conditions.reason("port") == ""
 
 
-def test_a_flapping_condition_is_logged_again_when_it_is_stable(
+def test_flapping_condition_is_logged_again_when_it_is_stable(
     told: pytest.LogCaptureFixture,
 ) -> None:
     conditions = FaultLog()
@@ -57,7 +57,7 @@ def test_a_flapping_condition_is_logged_again_when_it_is_stable(
 
 
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans(), st.integers(1, 20)), max_size=400))
-def test_a_flapping_condition_logs_a_bounded_number_of_lines(
+def test_flapping_condition_logs_a_bounded_number_of_lines(
     happenings: list[tuple[str, bool, int]],
 ) -> None:
     conditions = FaultLog()

@@ -163,7 +163,7 @@ def test_each_esc_gets_its_own_adapter_after_replugging(
 
 
 @pytest.mark.promise("adapter-identity")
-def test_an_esc_is_found_by_its_adapter(there: dict[str, UsbIdentity | None], bench: Bench) -> None:
+def test_esc_is_found_by_its_adapter(there: dict[str, UsbIdentity | None], bench: Bench) -> None:
     there.clear()
     bench.lose(0, SECOND)
     there["/dev/ttyUSB1"] = LEFT
@@ -209,7 +209,7 @@ def test_line_errors_are_counted_by_kind_across_replugging(
 
 
 @pytest.mark.promise("esc-diagnosis")
-def test_a_diagnosis_is_logged_once_and_ends_with_telemetry(
+def test_diagnosis_is_logged_once_and_ends_with_telemetry(
     bench: Bench,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -248,7 +248,7 @@ def test_a_diagnosis_is_logged_once_and_ends_with_telemetry(
     assert len(said) == 2, "it is said again for another loss"
 
 
-def test_an_unplugged_port_is_logged_once_until_it_is_back(
+def test_unplugged_port_is_logged_once_until_it_is_back(
     there: dict[str, UsbIdentity | None],
     bench: Bench,
     caplog: pytest.LogCaptureFixture,
@@ -275,7 +275,7 @@ def test_an_unplugged_port_is_logged_once_until_it_is_back(
     ]
 
 
-def test_a_mini_uart_causes_a_warning_when_it_is_opened(
+def test_mini_uart_causes_a_warning_when_it_is_opened(
     there: dict[str, UsbIdentity | None],
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
@@ -319,7 +319,7 @@ def test_information_that_names_another_device_again_and_again_is_summarised(
     assert line.startswith("esc1: layout or device: happened ")
 
 
-def test_a_loss_is_reported_with_its_errors(
+def test_loss_is_reported_with_its_errors(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -351,7 +351,7 @@ def test_a_loss_is_reported_with_its_errors(
 
 
 @pytest.mark.promise("adapter-identity")
-def test_a_usb_adapter_is_identified_by_its_numbers_or_its_location(
+def test_usb_adapter_is_identified_by_its_numbers_or_its_location(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     plugged = {
@@ -440,7 +440,7 @@ def test_settings_are_checked_every_100_ms_while_the_esc_sends(
 
 
 @pytest.mark.parametrize("hangs_up", [False, True])
-def test_an_unreadable_port_is_lost_in_that_turn_and_others_are_read(
+def test_unreadable_port_is_lost_in_that_turn_and_others_are_read(
     hangs_up: bool,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
@@ -537,7 +537,7 @@ def test_echo_is_switched_off_before_anything_else(monkeypatch: pytest.MonkeyPat
     assert echoes == [0]
 
 
-def test_an_adapter_unplugged_while_it_is_set_up_is_a_plain_error(
+def test_adapter_unplugged_while_it_is_set_up_is_a_plain_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     opened = serial_port._open
@@ -555,7 +555,7 @@ def test_an_adapter_unplugged_while_it_is_set_up_is_a_plain_error(
         serial_port.SerialPort(esc.path, KONTRONIK)
 
 
-def test_a_raspberry_pis_mini_uart_is_recognised_by_its_device_tree(tmp_path: Path) -> None:
+def test_raspberry_pis_mini_uart_is_recognised_by_its_device_tree(tmp_path: Path) -> None:
     device = tmp_path / "sys/devices/platform/soc/3f215040.serial"
     (device / "of_node").mkdir(parents=True)
     (device / "of_node/compatible").write_bytes(b"brcm,bcm2835-aux-uart\0")

@@ -77,7 +77,7 @@ def test_frames_recording_and_statistics_leave_no_garbage(tmp_path: Path) -> Non
     assert written > 50_000
 
 
-def test_the_loop_leaves_no_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loop_leaves_no_garbage(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop has ports, conditions and a CAN side. Lines stop and resume, and it is held up."""
     setup, layout = EVERYTHING
     world = World(2)

@@ -141,7 +141,7 @@ def test_after_any_hold_up_values_end_in_time_and_ages_are_true(
 
 
 @pytest.mark.parametrize("sends", [True, False])
-def test_the_loop_checks_its_ports_four_times_per_shortest_time_out(
+def test_loop_checks_its_ports_four_times_per_shortest_time_out(
     monkeypatch: pytest.MonkeyPatch,
     sends: bool,
 ) -> None:
@@ -196,7 +196,7 @@ def test_bytes_beyond_one_read_are_dated_by_their_position(
 
 
 @pytest.mark.promise("ports-fair")
-def test_a_port_that_always_has_bytes_does_not_delay_other_ports(
+def test_port_that_always_has_bytes_does_not_delay_other_ports(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each frame of the other port is sent at most two reads later.
@@ -227,7 +227,7 @@ def test_a_port_that_always_has_bytes_does_not_delay_other_ports(
 
 
 @pytest.mark.parametrize("is_reopened", [False, True])
-def test_a_frame_that_waits_in_a_newly_opened_port_is_never_sent(
+def test_frame_that_waits_in_a_newly_opened_port_is_never_sent(
     monkeypatch: pytest.MonkeyPatch,
     is_reopened: bool,
 ) -> None:
@@ -318,7 +318,7 @@ def test_bytes_left_in_a_lost_port_do_not_age_the_bytes_after_reopening(
     assert at - 300 * MS < esc.live_bound_ns <= wire.frames[-1]
 
 
-def test_a_hold_up_is_logged_in_one_line(
+def test_hold_up_is_logged_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -392,7 +392,7 @@ def test_frames_that_become_old_while_being_sent_are_computed_again(
         assert 0 <= at - whole - age * MS < 2 * MS
 
 
-def test_a_bus_that_takes_only_some_frames_gets_the_others_later(
+def test_bus_that_takes_only_some_frames_gets_the_others_later(
     monkeypatch: pytest.MonkeyPatch,
     core_language: str,
 ) -> None:
@@ -435,7 +435,7 @@ def test_a_bus_that_takes_only_some_frames_gets_the_others_later(
         {1000, CAN_FD},
     ],
 )
-def test_the_watchdog_is_fed_only_while_everything_is_served(
+def test_watchdog_is_fed_only_while_everything_is_served(
     monkeypatch: pytest.MonkeyPatch,
     blind: set[int],
 ) -> None:
@@ -487,7 +487,7 @@ def test_bytes_received_while_the_interface_was_opened_are_old(
     assert {number for _, number, _ in values(world)} == {len(wire.frames)}
 
 
-def test_a_slow_bus_gets_the_newest_values_in_order(
+def test_slow_bus_gets_the_newest_values_in_order(
     monkeypatch: pytest.MonkeyPatch,
     core_language: str,
 ) -> None:
@@ -521,7 +521,7 @@ def test_a_slow_bus_gets_the_newest_values_in_order(
 
 
 @pytest.mark.parametrize("clock_error_s", [-3600, 3600])
-def test_a_frame_received_in_a_hold_up_has_its_true_age(
+def test_frame_received_in_a_hold_up_has_its_true_age(
     monkeypatch: pytest.MonkeyPatch,
     clock_error_s: int,
 ) -> None:
@@ -639,7 +639,7 @@ def of(frames: list[tuple[int, bytes]], *ids: int) -> list[tuple[int, str]]:
         (0x7E5, f"04 01 00 00 {ZEROS}", 0x7E4, f"5e 01 00 00 {ZEROS}", NmtState.OPERATIONAL),
     ],
 )
-def test_a_waiting_command_is_obeyed_and_answered_once(
+def test_waiting_command_is_obeyed_and_answered_once(
     bench: Bench,
     can_id: int,
     request_hex: str,
@@ -658,7 +658,7 @@ def test_a_waiting_command_is_obeyed_and_answered_once(
     assert bench.state is state
 
 
-def test_an_interface_that_opens_slowly_is_not_a_hold_up(
+def test_interface_that_opens_slowly_is_not_a_hold_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = Bench(monkeypatch, opening_ns=HELD_UP_NS)
@@ -749,7 +749,7 @@ def test_waiting_answers_are_kept_and_measurements_are_computed_again(bench: Ben
     assert 0x123 not in sent_ids, "a frame without a replacement is dropped too"
 
 
-def test_a_hold_up_within_a_turn_discards_values_but_no_answers(
+def test_hold_up_within_a_turn_discards_values_but_no_answers(
     bench: Bench,
 ) -> None:
     world = bench.world
@@ -804,7 +804,7 @@ def test_emergencies_of_a_hold_up_are_sent_in_order_of_time(
     assert [each.replace(" ", "") for each in history] == codes[::-1]
 
 
-def test_an_error_of_the_esc_in_a_hold_up_precedes_the_loss(bench: Bench) -> None:
+def test_error_of_the_esc_in_a_hold_up_precedes_the_loss(bench: Bench) -> None:
     """The frames that waited are younger than the timeout. The frame before them is older."""
     start = bench.world.now
     wire = bench.wire
@@ -817,7 +817,7 @@ def test_an_error_of_the_esc_in_a_hold_up_precedes_the_loss(bench: Bench) -> Non
     assert sent[:2] == [UNDERVOLTAGE, LOST]
 
 
-def test_a_heartbeat_that_arrived_late_precedes_the_loss(bench: Bench) -> None:
+def test_heartbeat_that_arrived_late_precedes_the_loss(bench: Bench) -> None:
     bench.write(WATCH[1], "23 16 10 01 64 00 05 00")  # node 5: 100 ms
     bench.world.bus.came(0x705, b"\x05")
     bench.speed_until(20 * MS)
@@ -826,14 +826,14 @@ def test_a_heartbeat_that_arrived_late_precedes_the_loss(bench: Bench) -> None:
     assert emergencies(bench)[:2] == [HEARTBEAT_LOST, LOST]
 
 
-def test_the_loss_is_reported_before_the_node_stops_because_of_it(bench: Bench) -> None:
+def test_loss_is_reported_before_the_node_stops_because_of_it(bench: Bench) -> None:
     bench.write("2f 29 10 02 02 00 00 00")  # 1029h:2: STOPPED
     bench.run(SECOND)
     assert emergencies(bench) == [LOST]
     assert bench.state is NmtState.STOPPED
 
 
-def test_a_loss_that_a_hold_up_hides_is_logged_between_the_two_good_states(
+def test_loss_that_a_hold_up_hides_is_logged_between_the_two_good_states(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Loss and return are found in one iteration, so the link's state is the same after it."""
@@ -857,7 +857,7 @@ def test_a_loss_that_a_hold_up_hides_is_logged_between_the_two_good_states(
     ]
 
 
-def test_the_end_of_a_loop_is_logged_with_reason_and_totals(
+def test_end_of_a_loop_is_logged_with_reason_and_totals(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = World()
@@ -878,7 +878,7 @@ def test_the_end_of_a_loop_is_logged_with_reason_and_totals(
     assert loop.conditions.recent[-1].endswith(expected)
 
 
-def test_a_fault_of_the_program_is_logged_in_the_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fault_of_the_program_is_logged_in_the_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World()
     loop = loop_in(world, monkeypatch)
     loop.open()

@@ -62,7 +62,7 @@ class Hung:
         return [round((after - before) / SECOND, 1) for before, after in pairwise(self.asked)]
 
 
-def test_the_first_restart_is_in_time_and_later_ones_back_off(kernel: Kernel) -> None:  # noqa: F811
+def test_first_restart_is_in_time_and_later_ones_back_off(kernel: Kernel) -> None:  # noqa: F811
     it = Hung(kernel)
     it.hang()
     pauses = it.run(60, restarts=True)
@@ -79,7 +79,7 @@ def test_the_first_restart_is_in_time_and_later_ones_back_off(kernel: Kernel) ->
     assert 0.5 <= (it.asked[0] - it.begin) / SECOND < 0.8, "the pause is short again"
 
 
-def test_an_outage_is_reported_once_and_its_restarts_at_its_end(
+def test_outage_is_reported_once_and_its_restarts_at_its_end(
     kernel: Kernel,  # noqa: F811
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -96,7 +96,7 @@ def test_an_outage_is_reported_once_and_its_restarts_at_its_end(
     ]
 
 
-def test_a_missing_unit_is_reported_once_with_the_remedy(
+def test_missing_unit_is_reported_once_with_the_remedy(
     kernel: Kernel,  # noqa: F811
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -117,7 +117,7 @@ def test_requests_without_an_answer_back_off(kernel: Kernel) -> None:  # noqa: F
 
 
 @pytest.mark.parametrize("is_free_at_times", [False, True])
-def test_an_adapter_with_a_buffer_of_its_own_is_restarted_ever_more_rarely(
+def test_adapter_with_a_buffer_of_its_own_is_restarted_ever_more_rarely(
     kernel: Kernel,  # noqa: F811
     is_free_at_times: bool,
     caplog: pytest.LogCaptureFixture,
@@ -152,7 +152,7 @@ def test_nothing_is_requested_without_the_key_or_socketcan(
     assert it.asked == []
 
 
-def test_an_interface_that_another_program_restarts_is_not_counted(
+def test_interface_that_another_program_restarts_is_not_counted(
     kernel: Kernel,  # noqa: F811
 ) -> None:
     it = Hung(kernel)
@@ -160,7 +160,7 @@ def test_an_interface_that_another_program_restarts_is_not_counted(
     assert it.bench.gateway.status.can_restarts == 0
 
 
-def test_a_link_that_hangs_asks_for_a_restart_and_counts_it(kernel: Kernel) -> None:  # noqa: F811
+def test_link_that_hangs_asks_for_a_restart_and_counts_it(kernel: Kernel) -> None:  # noqa: F811
     it = Hung(kernel)
     bench = it.bench
     it.hang()
@@ -174,7 +174,7 @@ def test_a_link_that_hangs_asks_for_a_restart_and_counts_it(kernel: Kernel) -> N
     assert not bench.gateway.is_held
 
 
-def test_a_request_changes_the_file_of_the_interface(tmp_path: Path) -> None:
+def test_request_changes_the_file_of_the_interface(tmp_path: Path) -> None:
     request("can7")
     first = request_file("can7").stat().st_mtime_ns
     assert request_file("can7") == tmp_path / "run/kontronik-can-gw/restart/can7"
@@ -204,7 +204,7 @@ def _link_of_the_folder(path: Path, target: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [_link_to_a_file, _link_to_no_file, _fifo, _link_of_the_folder])
-def test_a_request_opens_only_a_regular_file(
+def test_request_opens_only_a_regular_file(
     tmp_path: Path,
     make: Callable[[Path, Path], None],
 ) -> None:
@@ -220,7 +220,7 @@ def test_a_request_opens_only_a_regular_file(
         assert f"{path}: it is not a regular file. Remove it" in remedy("can7")
 
 
-def test_an_ordinary_user_is_told_that_nobody_follows_the_request(
+def test_ordinary_user_is_told_that_nobody_follows_the_request(
     kernel: Kernel,  # noqa: F811
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,

@@ -51,7 +51,7 @@ def size_of(folder: Path) -> int:
 
 
 @pytest.mark.rights
-def test_a_service_notifies_ready_and_alive_records_and_notifies_its_end(
+def test_service_notifies_ready_and_alive_records_and_notifies_its_end(
     tmp_path: Path,
 ) -> None:
     """The configuration is of 0.5.0. Its CAN log beside the capture is no longer written."""
@@ -129,7 +129,7 @@ def test_a_service_notifies_ready_and_alive_records_and_notifies_its_end(
         assert re.fullmatch(r".*\.dbc, layout [0-9A-F]{8}", found.provenance["DBC"])
 
 
-def test_a_service_that_cannot_start_reports_why_and_waits_before_it_ends(tmp_path: Path) -> None:
+def test_service_that_cannot_start_reports_why_and_waits_before_it_ends(tmp_path: Path) -> None:
     config = tmp_path / "gateway.toml"
     config.write_text("nonsense")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
@@ -149,7 +149,7 @@ def test_a_service_that_cannot_start_reports_why_and_waits_before_it_ends(tmp_pa
     assert b"Traceback" not in errors
 
 
-def test_a_port_never_gets_the_number_of_a_closed_standard_stream(tmp_path: Path) -> None:
+def test_port_never_gets_the_number_of_a_closed_standard_stream(tmp_path: Path) -> None:
     """If descriptor 2 is closed, a port could get its number.
 
     Messages to standard error would then be sent to the ESC.
@@ -237,7 +237,7 @@ def test_status_finds_gateways_run_by_hand_until_they_end(tmp_path: Path) -> Non
     assert not list(tmp_path.glob("*/**/status/*"))
 
 
-def test_a_second_gateway_with_the_same_configuration_has_no_status(
+def test_second_gateway_with_the_same_configuration_has_no_status(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -252,7 +252,7 @@ def test_a_second_gateway_with_the_same_configuration_has_no_status(
     first.close()
 
 
-def test_a_gateway_that_cannot_start_reports_only_the_reason(
+def test_gateway_that_cannot_start_reports_only_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
@@ -303,7 +303,7 @@ def wait_for(condition: Callable[[], object], process: subprocess.Popen[bytes]) 
         time.sleep(0.05)
 
 
-def test_a_signal_and_a_lost_port_are_recorded_by_the_running_program(tmp_path: Path) -> None:
+def test_signal_and_a_lost_port_are_recorded_by_the_running_program(tmp_path: Path) -> None:
     status = tmp_path / "status.json"
     log = tmp_path / "errors"
 

@@ -45,7 +45,7 @@ class Kernel:
         ("can0", "", errno.ENODEV, f"If its adapter is plugged in: {UP}."),
     ],
 )
-def test_the_advice_of_run_and_monitor_fits_the_kind(
+def test_advice_of_run_and_monitor_fits_the_kind(
     name: str,
     kind: str,
     number: int,

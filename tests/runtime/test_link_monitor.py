@@ -95,7 +95,7 @@ def heard(*datagrams: bytes | int) -> list[LinkFacts]:
         (77, 0x10041, None, True),
     ],
 )
-def test_the_state_of_a_controller_is_read_from_its_report(
+def test_state_of_a_controller_is_read_from_its_report(
     number: int,
     flags: int,
     state: CanState | None,
@@ -121,7 +121,7 @@ def test_other_interfaces_are_ignored_and_a_removed_one_is_gone() -> None:
     assert [facts.exists for facts in heard(datagram)] == [True, False]
 
 
-def test_the_kernel_is_asked_again_after_an_overrun() -> None:
+def test_kernel_is_asked_again_after_an_overrun() -> None:
     monitor, fake = monitor_of(105, link_message())
     assert len(monitor.take()) == 1
     assert len(fake.sent) == 1
@@ -139,7 +139,7 @@ def test_damaged_messages_raise_no_exception(
     heard(bytes(message[:end]), rubbish or b"?")
 
 
-def test_the_real_kernel_reports_an_interface_and_a_missing_one() -> None:
+def test_real_kernel_reports_an_interface_and_a_missing_one() -> None:
     found = []
     for name in ("lo", "nocan77"):
         monitor = link_monitor.link_monitor(name)

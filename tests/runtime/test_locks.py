@@ -39,7 +39,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.rights
-def test_a_lock_is_exclusive_until_it_is_released(folder: Path) -> None:
+def test_lock_is_exclusive_until_it_is_released(folder: Path) -> None:
     first = Locks()
     second = Locks()
     assert first.lock_only(NODES[:2]) == []
@@ -56,7 +56,7 @@ def test_a_lock_is_exclusive_until_it_is_released(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("target")])
-def test_a_lock_is_a_regular_file(
+def test_lock_is_a_regular_file(
     folder: Path,
     make: Callable[[Path], object],
     caplog: pytest.LogCaptureFixture,
@@ -72,7 +72,7 @@ def test_a_lock_is_a_regular_file(
     locks.close()
 
 
-def test_a_lock_file_that_its_holder_removes_is_created_again(
+def test_lock_file_that_its_holder_removes_is_created_again(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -97,7 +97,7 @@ def test_a_lock_file_that_its_holder_removes_is_created_again(
 
 
 @pytest.mark.parametrize("what", ["dbc", "canopen", "dronecan"])
-def test_a_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -> None:
+def test_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -> None:
     tables = {
         "can": {"channel": CHANNEL},
         "dbc": {"enabled": what == "dbc"},
@@ -124,7 +124,7 @@ def test_a_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -
 
 
 @pytest.mark.parametrize("kind", ["folder", "link", "no locks there"])
-def test_a_lock_that_cannot_be_taken_is_reported_once_and_not_needed(
+def test_lock_that_cannot_be_taken_is_reported_once_and_not_needed(
     kind: str,
     folder: Path,
     tmp_path: Path,
@@ -187,7 +187,7 @@ def assign_node_id(link: CanLink, node_id: int) -> None:
     link.follow_ids()
 
 
-def test_a_node_id_assigned_by_lss_is_locked(
+def test_node_id_assigned_by_lss_is_locked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     link = waiting_gateway(monkeypatch)
@@ -201,7 +201,7 @@ def test_a_node_id_assigned_by_lss_is_locked(
     other.close()
 
 
-def test_a_node_id_assigned_by_lss_that_another_gateway_has_is_logged(
+def test_node_id_assigned_by_lss_that_another_gateway_has_is_logged(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:

@@ -84,7 +84,7 @@ def settled() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
-def test_a_thousand_events_leave_no_allocation(
+def test_thousand_events_leave_no_allocation(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     settled: None,

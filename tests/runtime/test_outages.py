@@ -182,7 +182,7 @@ def test_nothing_is_handed_over_while_no_frame_leaves(monkeypatch: pytest.Monkey
         (NO_MESSAGES, [drone()], (0x1F01552A, None)),
     ],
 )
-def test_the_first_frame_carries_no_measurement(
+def test_first_frame_carries_no_measurement(
     layout: MessageLayout,
     outputs: list[OutputMaker],
     first: tuple[int, bytes | None],
@@ -203,7 +203,7 @@ def test_the_first_frame_carries_no_measurement(
 
 
 @in_both_cores
-def test_a_blocked_interface_that_is_restarted_sends_no_old_value(
+def test_blocked_interface_that_is_restarted_sends_no_old_value(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The restart discards the frames in the kernel and in the controller."""
@@ -229,7 +229,7 @@ def test_a_blocked_interface_that_is_restarted_sends_no_old_value(
     assert [frame.can_id for _, frame in after].count(0x701) >= 1
 
 
-def test_a_recording_that_begins_in_an_outage_holds_frames_in_its_replay() -> None:
+def test_recording_that_begins_in_an_outage_holds_frames_in_its_replay() -> None:
     settings = CoreSettings(ESCS, layout_of(ESCS))
     gateway = RecordedGateway(lambda *_: None, settings, 0)
     gateway.start(0)

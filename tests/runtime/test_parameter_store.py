@@ -106,7 +106,7 @@ def test_saving_is_refused_if_no_thread_can_be_started(
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("target")])
-def test_a_file_that_is_not_regular_is_neither_read_nor_awaited(
+def test_file_that_is_not_regular_is_neither_read_nor_awaited(
     tmp_path: Path,
     store: ParameterStore,
     make: Callable[[Path], object],
@@ -131,7 +131,7 @@ OTHER_VERSION = OLD.replace(b'"version":1', b'"version":9')
     "data",
     [OLD[:-5], b"", b"\0" * 200, OLD + b"\n", OTHER_VERSION],
 )
-def test_a_damaged_file_is_reported_and_the_newest_one_is_kept(
+def test_damaged_file_is_reported_and_the_newest_one_is_kept(
     tmp_path: Path,
     store: ParameterStore,
     data: bytes,
@@ -150,7 +150,7 @@ def test_a_damaged_file_is_reported_and_the_newest_one_is_kept(
     assert (folder / "esc1.params.damaged").read_bytes() == data
 
 
-def test_an_unreadable_file_is_kept_and_half_a_new_file_is_never_read(
+def test_unreadable_file_is_kept_and_half_a_new_file_is_never_read(
     tmp_path: Path,
     store: ParameterStore,
     monkeypatch: pytest.MonkeyPatch,
@@ -363,7 +363,7 @@ def faults(files: dict[str, str], steps: list[Step]) -> list[str]:
 
 @pytest.mark.parametrize("left_over", [False, True])
 @pytest.mark.parametrize("first", [False, True])
-def test_a_loss_of_power_at_any_instant_leaves_the_old_or_new_content(
+def test_loss_of_power_at_any_instant_leaves_the_old_or_new_content(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     left_over: bool,
@@ -389,7 +389,7 @@ def test_a_loss_of_power_at_any_instant_leaves_the_old_or_new_content(
     assert faults(files, steps) == []
 
 
-def test_a_damaged_file_exists_at_every_instant(
+def test_damaged_file_exists_at_every_instant(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -413,7 +413,7 @@ OF_THE_FILE = [(step, TEMPORARY) for step in ("create", "write", "fsync", "close
 
 
 @pytest.mark.parametrize("failing", [*OF_THE_FILE, ("fsync", "params")])
-def test_a_failure_at_any_step_is_reported_and_leaves_a_complete_file(
+def test_failure_at_any_step_is_reported_and_leaves_a_complete_file(
     tmp_path: Path,
     store: ParameterStore,
     monkeypatch: pytest.MonkeyPatch,
@@ -433,7 +433,7 @@ def test_a_failure_at_any_step_is_reported_and_leaves_a_complete_file(
 # --- two gateways
 
 
-def test_a_node_is_locked_by_one_gateway_until_it_closes(tmp_path: Path) -> None:
+def test_node_is_locked_by_one_gateway_until_it_closes(tmp_path: Path) -> None:
     first = ParameterStore(tmp_path / "store")
     second = ParameterStore(tmp_path / "store")
     first.lock("esc1")

@@ -70,7 +70,7 @@ class Bench:
         return self.loop.gateway.status.is_quiet
 
 
-def test_the_loop_wakes_about_once_a_second_in_quiet_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loop_wakes_about_once_a_second_in_quiet_mode(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(monkeypatch)
     frames = bench.run(QUIET_AFTER_S + 1)
     assert frames[-1] == (STATE_ID, bytes((GatewayState.QUIET,)) + bytes(7))
@@ -197,7 +197,7 @@ def test_requests_are_answered_in_quiet_mode(monkeypatch: pytest.MonkeyPatch) ->
     bench.loop.close()
 
 
-def test_an_interface_that_returns_in_quiet_mode_gets_no_frame(
+def test_interface_that_returns_in_quiet_mode_gets_no_frame(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """systemd may set it down for a suspend of the machine."""
@@ -223,7 +223,7 @@ def test_an_interface_that_returns_in_quiet_mode_gets_no_frame(
     bench.loop.close()
 
 
-def test_the_begin_and_the_end_of_quiet_mode_are_logged_at_once(
+def test_begin_and_the_end_of_quiet_mode_are_logged_at_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """In C, too, whose iterations could otherwise go on for long without a line in the log."""

@@ -59,7 +59,7 @@ def test_root_and_the_services_user_share_the_systems_folder(
     assert folders.runtime_folder("status") == root / "tmp" / "kontronik-can-gw-990" / "status"
 
 
-def test_the_folder_of_a_session_is_preferred_to_the_one_in_tmp(
+def test_folder_of_a_session_is_preferred_to_the_one_in_tmp(
     root: Path,
     ordinary_user: int,
     monkeypatch: pytest.MonkeyPatch,
@@ -93,7 +93,7 @@ def test_without_a_session_the_folder_in_tmp_is_private_and_locks_hold(
 
 
 @pytest.mark.parametrize("kind", ["writable by all", "link", "file"])
-def test_a_folder_in_tmp_that_another_user_controls_is_refused(
+def test_folder_in_tmp_that_another_user_controls_is_refused(
     root: Path,
     ordinary_user: int,
     kind: str,

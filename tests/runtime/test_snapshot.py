@@ -115,7 +115,7 @@ def test_errors_warnings_and_statuses_are_separate() -> None:
     assert shown["statuses"] == ["programming_allowed"]
 
 
-def test_the_figures_of_the_process_match_proc(tmp_path: Path) -> None:
+def test_figures_of_the_process_match_proc(tmp_path: Path) -> None:
     before = process_facts()
     opened = [(tmp_path / f"{n}").open("w") for n in range(5)]
     after = process_facts()
@@ -129,7 +129,7 @@ def test_the_figures_of_the_process_match_proc(tmp_path: Path) -> None:
     assert abs(after.rss_bytes - resident) < 0.2 * resident
 
 
-def test_a_process_is_identified_by_its_start_until_it_has_ended() -> None:
+def test_process_is_identified_by_its_start_until_it_has_ended() -> None:
     facts = program_facts("gateway.toml")
     assert facts.pid == os.getpid()
     assert facts.ticks == start_ticks(os.getpid()) > 0
@@ -141,5 +141,5 @@ def test_a_process_is_identified_by_its_start_until_it_has_ended() -> None:
     assert start_ticks(child) == 0
 
 
-def test_the_times_of_a_status_are_utc() -> None:
+def test_times_of_a_status_are_utc() -> None:
     assert utc(1_700_000_000.9) == "2023-11-14T22:13:20Z"

@@ -76,7 +76,7 @@ def statistics(file: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Statisti
     made.close()
 
 
-def test_the_content_is_on_the_disk_before_it_replaces_the_old_one(
+def test_content_is_on_the_disk_before_it_replaces_the_old_one(
     file: Path,
     statistics: Statistics,
     monkeypatch: pytest.MonkeyPatch,
@@ -96,7 +96,7 @@ def test_the_content_is_on_the_disk_before_it_replaces_the_old_one(
     assert number_in(file) == 2
 
 
-def test_the_file_is_complete_readable_by_all_and_removed_at_the_end(
+def test_file_is_complete_readable_by_all_and_removed_at_the_end(
     file: Path,
     statistics: Statistics,
 ) -> None:
@@ -122,7 +122,7 @@ def test_the_file_is_complete_readable_by_all_and_removed_at_the_end(
     assert threading.active_count() == threads
 
 
-def test_a_file_of_the_user_is_neither_replaced_nor_removed(
+def test_file_of_the_user_is_neither_replaced_nor_removed(
     file: Path, statistics: Statistics
 ) -> None:
     file.write_text("mine")
@@ -151,7 +151,7 @@ def test_file_that_a_killed_gateway_left_is_replaced(
     assert not file.exists()
 
 
-def test_a_disk_that_does_not_answer_is_reported_once_until_it_does(
+def test_disk_that_does_not_answer_is_reported_once_until_it_does(
     file: Path,
     statistics: Statistics,
     monkeypatch: pytest.MonkeyPatch,
@@ -187,7 +187,7 @@ def test_a_disk_that_does_not_answer_is_reported_once_until_it_does(
     ("trouble", "said"),
     [("no folder", "No such file"), ("no file", "not a regular file"), ("full", "No space left")],
 )
-def test_a_file_that_cannot_be_written_is_reported_once_until_it_can(
+def test_file_that_cannot_be_written_is_reported_once_until_it_can(
     trouble: str,
     said: str,
     file: Path,

@@ -102,7 +102,7 @@ def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 # --- the judgement
 
 
-def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
+def test_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
     bench = heard()
     bench.silent.add(1)
     bench.run(2)
@@ -114,7 +114,7 @@ def test_an_esc_that_is_not_heard_is_a_fault_with_its_reason() -> None:
     assert seen.faults[0].startswith("esc2: no bytes: ESC off")
 
 
-def test_the_old_name_of_faults_has_the_same_texts() -> None:
+def test_old_name_of_faults_has_the_same_texts() -> None:
     bench = heard()
     bench.silent.add(1)
     bench.run(2)
@@ -172,7 +172,7 @@ def test_each_fault_is_reported_as_a_sentence(
     assert list(seen.faults) == said
 
 
-def test_the_last_recorded_event_and_its_file_are_shown() -> None:
+def test_last_recorded_event_and_its_file_are_shown() -> None:
     document = heard().document()
     facts = EventRecorderFacts(ring_bytes=1_200_000)
     document["recording"] = vars(facts)
@@ -190,7 +190,7 @@ def test_the_last_recorded_event_and_its_file_are_shown() -> None:
     assert "last event at 2026-11-28T21:00:00Z: hot, /captures/a.kcap" in shown
 
 
-def test_a_document_older_than_three_seconds_shows_no_value() -> None:
+def test_document_older_than_three_seconds_shows_no_value() -> None:
     document = heard().document()
     assert judged(document, STALE_NS).code == HEALTHY
     seen = judged(document, 12 * SECOND)
@@ -209,7 +209,7 @@ def test_a_document_older_than_three_seconds_shows_no_value() -> None:
 CONTENTS = (b"", b"{", b"7", b"{}", b"\xff\xfe", b'{"format": 2}', b"[" * 100_000, b"1" * 5000)
 
 
-def test_a_file_that_is_no_statistics_file_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_file_that_is_no_statistics_file_is_refused_in_one_line(tmp_path: Path) -> None:
     file = tmp_path / "status.json"
     for content in CONTENTS:
         file.write_bytes(content)
@@ -223,7 +223,7 @@ def test_a_file_that_is_no_statistics_file_is_refused_in_one_line(tmp_path: Path
         assert said in refused(NOT_RUNNING, "status", "--file", tmp_path / name)
 
 
-def test_a_configuration_selects_its_file_or_the_service_of_its_name(
+def test_configuration_selects_its_file_or_the_service_of_its_name(
     tmp_path: Path,
     run_folder: Path,
 ) -> None:
@@ -254,7 +254,7 @@ def test_a_configuration_selects_its_file_or_the_service_of_its_name(
     assert shell("-c", elsewhere)[0] == HEALTHY
 
 
-def test_a_broken_configuration_in_this_folder_is_only_a_warning(
+def test_broken_configuration_in_this_folder_is_only_a_warning(
     run_folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -359,7 +359,7 @@ def test_json_is_one_document_with_the_judgement_and_the_file_content(tmp_path: 
 WHOLE = with_nodes(heard(3).document(log_lines=["14:03:01 esc1: telemetry lost"]))
 
 
-def test_a_count_and_its_label_are_on_one_line() -> None:
+def test_count_and_its_label_are_on_one_line() -> None:
     document: Any = json.loads(json.dumps(WHOLE))
     for counts in (0, 7, 4_321, 98_765_432):
         document["can"]["counters"] = dict.fromkeys(document["can"]["counters"], counts)
@@ -411,7 +411,7 @@ def test_lines_of_any_document_contain_no_terminal_controls(
     assert all(line.plain.isprintable() for line in lines_of(seen))
 
 
-def test_a_text_in_place_of_a_time_is_not_multiplied() -> None:
+def test_text_in_place_of_a_time_is_not_multiplied() -> None:
     """The product would be larger than the memory."""
     document: Any = json.loads(json.dumps(WHOLE))
     document["process"]["uptime_s"] = "x" * 1_000_000

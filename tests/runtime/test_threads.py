@@ -27,7 +27,7 @@ def readable(fd: int) -> bool:
     return bool(select.select([fd], [], [], 0)[0])
 
 
-def test_a_handover_has_a_limit_and_is_readable_while_it_has_items() -> None:
+def test_handover_has_a_limit_and_is_readable_while_it_has_items() -> None:
     handover: Handover[int] = Handover(3)
     assert not readable(handover.fileno())
     assert [handover.put(n) for n in range(4)] == [True, True, True, False]
@@ -43,7 +43,7 @@ def test_a_handover_has_a_limit_and_is_readable_while_it_has_items() -> None:
     assert handover.fileno() == -1
 
 
-def test_a_closed_handover_never_writes_to_a_reused_descriptor() -> None:
+def test_closed_handover_never_writes_to_a_reused_descriptor() -> None:
     handover: Handover[int] = Handover()
     number = handover.fileno()
     handover.close()
@@ -58,7 +58,7 @@ def test_a_closed_handover_never_writes_to_a_reused_descriptor() -> None:
         os.close(other)
 
 
-def test_an_end_read_with_the_last_items_is_not_lost(
+def test_end_read_with_the_last_items_is_not_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     done: list[int] = []
@@ -78,7 +78,7 @@ def test_an_end_read_with_the_last_items_is_not_lost(
     assert done == [1]
 
 
-def test_a_job_that_fails_is_reported_and_the_next_job_is_done(
+def test_job_that_fails_is_reported_and_the_next_job_is_done(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -142,7 +142,7 @@ class StuckStream(io.StringIO):
         return len(text)
 
 
-def test_a_blocked_stream_delays_no_caller_and_losses_are_logged() -> None:
+def test_blocked_stream_delays_no_caller_and_losses_are_logged() -> None:
     stream = StuckStream()
     handler = BackgroundHandler(stream, longest_end_s=0)
     handler.handle(logging.makeLogRecord({"msg": "first"}))
@@ -164,7 +164,7 @@ def test_a_blocked_stream_delays_no_caller_and_losses_are_logged() -> None:
     "error",
     [OSError(5, "Input/output error"), ValueError("I/O operation on closed file")],
 )
-def test_a_stream_that_fails_raises_no_exception(error: Exception) -> None:
+def test_stream_that_fails_raises_no_exception(error: Exception) -> None:
     class Broken(io.StringIO):
         def write(self, text: str) -> int:
             raise error
@@ -200,7 +200,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> Scheduler:
     return scheduler
 
 
-def test_the_loop_has_priority_over_the_threads_beside_it(kernel: Scheduler) -> None:
+def test_loop_has_priority_over_the_threads_beside_it(kernel: Scheduler) -> None:
     ended = threading.Event()
     sleepers = [threading.Thread(target=ended.wait, daemon=True) for _ in range(2)]
     sleepers[0].start()
@@ -211,7 +211,7 @@ def test_the_loop_has_priority_over_the_threads_beside_it(kernel: Scheduler) -> 
     ended.set()
 
 
-def test_a_priority_that_is_not_permitted_is_reported_with_the_remedy(
+def test_priority_that_is_not_permitted_is_reported_with_the_remedy(
     kernel: Scheduler,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

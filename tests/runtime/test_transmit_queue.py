@@ -36,7 +36,7 @@ def send(queue: TransmitQueue, sent: list[CanFrame], count: int) -> int:
     return len(taken)
 
 
-def test_the_queue_is_bounded_and_counts_its_losses() -> None:
+def test_queue_is_bounded_and_counts_its_losses() -> None:
     queue = TransmitQueue()
     sent = list[CanFrame]()
     for n in range(QUEUE_LENGTH + 10):

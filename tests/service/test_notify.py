@@ -66,7 +66,7 @@ def test_ready_status_watchdog_and_end_are_notified(manager: Manager) -> None:
         (("😀" * 5000,), ["😀" * 750]),
     ],
 )
-def test_a_status_is_one_line_that_is_notified_when_it_changes(
+def test_status_is_one_line_that_is_notified_when_it_changes(
     manager: Manager,
     texts: tuple[str, ...],
     told: list[str],
@@ -84,7 +84,7 @@ def test_a_status_is_one_line_that_is_notified_when_it_changes(
     "address",
     ["", "vsock:2:1", "@", "/no/such/folder/notify", "/" + "x" * 300, "/with\0null"],
 )
-def test_an_unusable_socket_does_no_harm(address: str) -> None:
+def test_unusable_socket_does_no_harm(address: str) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000"})
     for _ in range(3):
         notifier.ready("x")
@@ -95,7 +95,7 @@ def test_an_unusable_socket_does_no_harm(address: str) -> None:
     assert Notifier({"WATCHDOG_USEC": "1000"}).watchdog_ns is None
 
 
-def test_a_full_socket_never_blocks_and_loses_no_state(manager: Manager) -> None:
+def test_full_socket_never_blocks_and_loses_no_state(manager: Manager) -> None:
     notifier = Notifier(manager.environment | WATCHED)
     for _ in range(5000):  # more than the capacity of any queue
         notifier.watchdog()
@@ -117,7 +117,7 @@ def test_a_full_socket_never_blocks_and_loses_no_state(manager: Manager) -> None
     assert manager.told() == [["STOPPING=1"]]
 
 
-def test_a_manager_that_returns_is_notified_again(tmp_path: Path) -> None:
+def test_manager_that_returns_is_notified_again(tmp_path: Path) -> None:
     path = tmp_path / "notify"
     notifier = Notifier({"NOTIFY_SOCKET": str(path)})
     for text in ("one", "three"):
@@ -140,7 +140,7 @@ def test_a_manager_that_returns_is_notified_again(tmp_path: Path) -> None:
         ({"WATCHDOG_USEC": "5", "WATCHDOG_PID": "me"}, None),
     ],
 )
-def test_the_watchdog_is_used_only_by_the_named_process(
+def test_watchdog_is_used_only_by_the_named_process(
     variables: dict[str, str],
     half: int | None,
 ) -> None:

@@ -49,7 +49,7 @@ def enabled(root: Path) -> dict[str, str]:
     return {link.name: str(link.readlink()) for link in links}
 
 
-def test_a_staged_install_writes_files_that_all_users_may_read(tmp_path: Path) -> None:
+def test_staged_install_writes_files_that_all_users_may_read(tmp_path: Path) -> None:
     done = install(tmp_path)
     assert done.code == 0
     names = [CONFIGURATION, *(place for place, _ in planned(""))]
@@ -68,7 +68,7 @@ def test_a_staged_install_writes_files_that_all_users_may_read(tmp_path: Path) -
     assert enabled(tmp_path) == {}
 
 
-def test_a_configuration_with_restarts_enables_the_unit_of_its_interface(tmp_path: Path) -> None:
+def test_configuration_with_restarts_enables_the_unit_of_its_interface(tmp_path: Path) -> None:
     install(tmp_path)
     text = edit(tmp_path) + '[can]\nchannel = "can7"\nrestart_after_s = 0.5\n'
     (tmp_path / CONFIGURATION).write_text(text)
@@ -79,7 +79,7 @@ def test_a_configuration_with_restarts_enables_the_unit_of_its_interface(tmp_pat
     assert tree(tmp_path) == [CONFIGURATION]
 
 
-def test_an_edited_configuration_is_kept_and_changed_files_are_backed_up(tmp_path: Path) -> None:
+def test_edited_configuration_is_kept_and_changed_files_are_backed_up(tmp_path: Path) -> None:
     install(tmp_path)
     text = edit(tmp_path)
     said = install(tmp_path, "--now").err
@@ -117,7 +117,7 @@ def test_uninstall_removes_installed_files_and_keeps_peoples_files(tmp_path: Pat
     assert "nothing is installed" in uninstall(tmp_path)
 
 
-def test_an_instance_has_its_own_configuration(tmp_path: Path) -> None:
+def test_instance_has_its_own_configuration(tmp_path: Path) -> None:
     for name in ("left", "status"):  # "status" was an action
         install(tmp_path, "--instance", name)
         edit(tmp_path, name)
@@ -131,7 +131,7 @@ def test_an_instance_has_its_own_configuration(tmp_path: Path) -> None:
     assert enabled(tmp_path) == {}
 
 
-def test_a_link_out_of_the_root_is_not_followed(tmp_path: Path) -> None:
+def test_link_out_of_the_root_is_not_followed(tmp_path: Path) -> None:
     for name in ("elsewhere", "root"):
         (tmp_path / name).mkdir()
     (tmp_path / "root/etc").symlink_to(tmp_path / "elsewhere")
@@ -152,12 +152,12 @@ def test_a_link_out_of_the_root_is_not_followed(tmp_path: Path) -> None:
         ("uninstall --now", "unrecognized arguments: --now"),
     ],
 )
-def test_a_wrong_use_is_reported_in_the_last_line(words: str, said: str) -> None:
+def test_wrong_use_is_reported_in_the_last_line(words: str, said: str) -> None:
     assert said in refused(2, "service", *words.split())
 
 
 @pytest.mark.parametrize("action", ["install", "uninstall"])
-def test_the_command_needs_systemd_and_root(
+def test_command_needs_systemd_and_root(
     action: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -177,14 +177,14 @@ def test_the_command_needs_systemd_and_root(
     "program",
     ["bin/x", "/a b", "/a%h/x", "/a/../x", '/a"x', "/a\nExec=/x"],
 )
-def test_a_program_that_a_unit_cannot_contain_is_refused(tmp_path: Path, program: str) -> None:
+def test_program_that_a_unit_cannot_contain_is_refused(tmp_path: Path, program: str) -> None:
     done = install(tmp_path, executable=program)
     assert done.code == 2
     assert tree(tmp_path) == []
     assert "is not an absolute path without spaces" in done.err
 
 
-def test_a_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path) -> None:
+def test_program_that_the_services_user_cannot_reach_is_refused(tmp_path: Path) -> None:
     (tmp_path / "opt").mkdir(0o700)
     with pytest.raises(UserError, match="the service's user cannot access /"):
         service._check_program(f"{tmp_path}/opt/x", is_own=False)

@@ -115,13 +115,13 @@ def test_systemd_shows_the_expected_state(facts: Facts, place: str, expected: Fa
         ("end", 0, ""),
     ],
 )
-def test_an_action_reports_its_result(facts: Facts, action: str, code: int, said: str) -> None:
+def test_action_reports_its_result(facts: Facts, action: str, code: int, said: str) -> None:
     done = facts[action]
     assert (done["code"], said in done["talk"]) == (code, True), done
     assert facts["same process"], "the process from before the faulty configuration"
 
 
-def test_the_service_runs_as_its_own_user_without_any_right(facts: Facts) -> None:
+def test_service_runs_as_its_own_user_without_any_right(facts: Facts) -> None:
     process = dict(line.split(":\t", 1) for line in facts["process"].splitlines() if ":\t" in line)
     assert "0" not in process["Uid"].split() + process["Gid"].split()
     assert len(process["Groups"].split()) == 3  # its own group and the groups of serial ports
@@ -137,7 +137,7 @@ def test_telemetry_of_a_port_of_its_groups_reaches_the_bus(facts: Facts) -> None
     assert "telemetry ok" in facts["running"]["StatusText"]
 
 
-def test_the_folders_of_the_service_have_its_owner_and_mode(facts: Facts) -> None:
+def test_folders_of_the_service_have_its_owner_and_mode(facts: Facts) -> None:
     assert facts["folders"] == {
         "/run/kontronik-can-gw": ["0o755", "kontronik-can-gw"],
         "/run/kontronik-can-gw/lock": ["0o755", "kontronik-can-gw"],
@@ -145,12 +145,12 @@ def test_the_folders_of_the_service_have_its_owner_and_mode(facts: Facts) -> Non
     }
 
 
-def test_the_folder_of_locks_remains_when_the_service_stops(facts: Facts) -> None:
+def test_folder_of_locks_remains_when_the_service_stops(facts: Facts) -> None:
     assert any("vcan0" in name and "messages" in name for name in facts["locks"])
     assert facts["locks after a stop"] == ["x"], "the file that the probe wrote"
 
 
-def test_a_killed_or_frozen_process_is_replaced_and_logs_its_stack(facts: Facts) -> None:
+def test_killed_or_frozen_process_is_replaced_and_logs_its_stack(facts: Facts) -> None:
     assert facts["running again after kill"] >= 0
     assert facts["fresh after kill"]
     assert facts["running again after freeze"] >= 5, "not before the watchdog's time has ended"
@@ -158,7 +158,7 @@ def test_a_killed_or_frozen_process_is_replaced_and_logs_its_stack(facts: Facts)
     assert "esc1: telemetry ok" in facts["both"][0]["StatusText"]
 
 
-def test_the_sandbox_allows_only_the_needed_actions(facts: Facts) -> None:
+def test_sandbox_allows_only_the_needed_actions(facts: Facts) -> None:
     needed = {"CAN socket", "netlink", "abstract socket", "state folder", "runtime folder"}
     needed |= {"lock folder", "terminal", "ctypes", "other processes", "machine-id", "clock state"}
     refused = dict.fromkeys(("internet", "packet"), "Errno 97")
@@ -174,11 +174,11 @@ def test_the_sandbox_allows_only_the_needed_actions(facts: Facts) -> None:
 
 
 @pytest.mark.skipif(not shared_object().exists(), reason="the core in C was not built")
-def test_the_c_core_can_be_loaded_in_the_sandbox(facts: Facts) -> None:
+def test_c_core_can_be_loaded_in_the_sandbox(facts: Facts) -> None:
     assert "core: C" in [message for _, message in facts["log"]]
 
 
-def test_the_state_of_the_clock_is_known_in_the_sandbox(facts: Facts) -> None:
+def test_state_of_the_clock_is_known_in_the_sandbox(facts: Facts) -> None:
     before, synchronised, stepped = facts["clock"]
     assert (before["synchronized"], before["max_error_s"], before["steps"]) == (False, None, 0)
     assert before["hardware"] == ""
@@ -190,7 +190,7 @@ def test_the_state_of_the_clock_is_known_in_the_sandbox(facts: Facts) -> None:
     assert any(message.startswith("the clock was set by +3600.") for message in messages)
 
 
-def test_a_blocked_interface_is_restarted_by_the_restart_unit(facts: Facts) -> None:
+def test_blocked_interface_is_restarted_by_the_restart_unit(facts: Facts) -> None:
     found = facts["restart"]
     assert found["install"]["code"] == 0, found["install"]
     assert found["path"]["UnitFileState"] == "enabled"
@@ -210,7 +210,7 @@ def test_metrics_are_served_and_the_gateway_still_cannot_use_ip(facts: Facts) ->
     assert probe == facts["probe"]
 
 
-def test_the_live_page_runs_and_asks_for_its_token(facts: Facts) -> None:
+def test_live_page_runs_and_asks_for_its_token(facts: Facts) -> None:
     found = facts["web"]
     assert found["before"]["UnitFileState"] == "disabled"
     assert (found["start"]["code"], found["page"]["ActiveState"]) == (0, "active")
@@ -228,12 +228,12 @@ def test_the_live_page_runs_and_asks_for_its_token(facts: Facts) -> None:
     assert facts["after uninstall"][2]["ActiveState"] == "inactive"
 
 
-def test_the_live_page_makes_a_report_in_its_sandbox(facts: Facts) -> None:
+def test_live_page_makes_a_report_in_its_sandbox(facts: Facts) -> None:
     assert facts["web"]["flight"]["summary"]["voltage"] > 10
     assert facts["web"]["report"] == 200
 
 
-def test_the_live_page_may_write_only_its_cache(facts: Facts) -> None:
+def test_live_page_may_write_only_its_cache(facts: Facts) -> None:
     process = dict(
         line.split(":\t", 1) for line in facts["web"]["process"].splitlines() if ":\t" in line
     )

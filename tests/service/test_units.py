@@ -93,7 +93,7 @@ def test_systemd_finds_no_fault_in_the_units(tmp_path: Path, beside: bool) -> No
 
 @pytest.mark.extended
 @pytest.mark.parametrize("beside", [False, True])
-def test_the_service_has_a_low_exposure_level(tmp_path: Path, beside: bool) -> None:
+def test_service_has_a_low_exposure_level(tmp_path: Path, beside: bool) -> None:
     for unit in units(tmp_path, beside):
         done = analyze("security", "--offline=true", "--no-pager", str(unit))
         found = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
@@ -102,7 +102,7 @@ def test_the_service_has_a_low_exposure_level(tmp_path: Path, beside: bool) -> N
 
 
 @pytest.mark.extended
-def test_the_restart_of_an_interface_has_a_low_exposure_level(tmp_path: Path) -> None:
+def test_restart_of_an_interface_has_a_low_exposure_level(tmp_path: Path) -> None:
     """docs/security.md states the figure."""
     for name in RESTART:
         (tmp_path / name.replace("@", "@can0")).write_text(files()[name])
@@ -118,7 +118,7 @@ def test_the_restart_of_an_interface_has_a_low_exposure_level(tmp_path: Path) ->
 # --- line by line
 
 
-def test_a_restart_takes_the_interface_from_the_instance_and_runs_only_ip() -> None:
+def test_restart_takes_the_interface_from_the_instance_and_runs_only_ip() -> None:
     path, service = (settings(files()[name]) for name in RESTART)
     request = str(RUN / NAME / FOLDER / "%i")
     assert {key: path[key] for key in path if key != "Description"} == {
@@ -136,7 +136,7 @@ EVERY = [*NAMES, *BESIDE]
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_service_never_gives_up_and_has_no_rights_of_root(name: str) -> None:
+def test_service_never_gives_up_and_has_no_rights_of_root(name: str) -> None:
     """test_under_systemd.py tries the forbidden actions under a real systemd."""
     unit = settings(files()[name])
     kept = {"Restart": "always", "StartLimitIntervalSec": "0", "TimeoutStopSec": "5s"}
@@ -156,7 +156,7 @@ LOCKING = [name for name in EVERY if "metrics" not in name and "web" not in name
 
 
 @pytest.mark.parametrize("name", LOCKING)
-def test_a_service_that_reports_to_systemd_is_watched(name: str) -> None:
+def test_service_that_reports_to_systemd_is_watched(name: str) -> None:
     """If it hangs, it is ended so that the log has the stack of each thread."""
     unit = settings(files()[name])
     kept = {"Type": "notify", "WatchdogSec": "10s", "TimeoutStartSec": "90s"}
@@ -165,14 +165,14 @@ def test_a_service_that_reports_to_systemd_is_watched(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LOCKING)
-def test_a_service_may_write_the_locks_that_all_gateways_share(name: str) -> None:
+def test_service_may_write_the_locks_that_all_gateways_share(name: str) -> None:
     lock = f"-{RUN / NAME / 'lock'}"
     wanted = f"{lock} -{RUN / NAME / 'restart'}" if name in NAMES else lock
     assert settings(files()[name])["ReadWritePaths"] == [wanted]
 
 
 @pytest.mark.parametrize("name", [name for name in EVERY if "web" in name])
-def test_the_live_page_may_write_only_its_cache_and_reach_only_private_networks(
+def test_live_page_may_write_only_its_cache_and_reach_only_private_networks(
     name: str,
 ) -> None:
     """docs/security.md states the figure."""
@@ -193,7 +193,7 @@ def test_the_live_page_may_write_only_its_cache_and_reach_only_private_networks(
 
 
 @pytest.mark.parametrize("name", [*EVERY, RESTART[1]])
-def test_a_service_may_not_write_below_run(name: str) -> None:
+def test_service_may_not_write_below_run(name: str) -> None:
     """systemd 252 leaves /run writable for a service that gets a /proc of its own."""
     unit = settings(files()[name])
     assert unit["ProtectSystem"] == ["strict"]
@@ -209,7 +209,7 @@ def test_statistics_are_readable_by_all_and_the_store_is_private(name: str) -> N
     assert {name: unit[name] for name in kept} == {name: [text] for name, text in kept.items()}
 
 
-def test_the_service_may_open_serial_ports_and_no_other_device() -> None:
+def test_service_may_open_serial_ports_and_no_other_device() -> None:
     """test_under_systemd.py tries the effect, and the folder of locks, under a real systemd."""
     unit = settings(files()[NAMES[0]])
     kinds = ("USB", "ACM", "S", "AMA", "SC", "mxc", "THS")
@@ -271,7 +271,7 @@ def allowed_families(unit: str) -> set[str]:
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_unit_permits_the_socket_families_that_its_command_opens(name: str) -> None:
+def test_unit_permits_the_socket_families_that_its_command_opens(name: str) -> None:
     unit = files()[name]
     (line,) = settings(unit)["ExecStart"]
     command = line.partition("/bin/true ")[2].split()[0]
@@ -297,11 +297,11 @@ def test_signal_usr1_does_not_end_the_gateway_while_the_interpreter_starts() -> 
     assert done.stdout == f"{words[at + 1 :]}\n"
 
 
-def test_the_gateway_may_use_only_can_rtnetlink_and_the_notify_socket() -> None:
+def test_gateway_may_use_only_can_rtnetlink_and_the_notify_socket() -> None:
     assert allowed_families(files()[NAMES[0]]) == {"AF_CAN", "AF_NETLINK", "AF_UNIX"}
 
 
-def test_an_instance_has_its_own_configuration_and_folders() -> None:
+def test_instance_has_its_own_configuration_and_folders() -> None:
     plain, own = (settings(files()[name]) for name in NAMES)
     changed = {name for name in plain if plain[name] != own[name]}
     assert changed == {"ExecStart", "StateDirectory", "RuntimeDirectory"}

@@ -99,14 +99,14 @@ def test_long_frames_are_sent_and_received_as_can_fd(vcan: str) -> None:
         assert all_of(other, vcan) == [long, short]
 
 
-def test_an_interface_without_can_fd_is_refused_with_the_remedy(vcan: str) -> None:
+def test_interface_without_can_fd_is_refused_with_the_remedy(vcan: str) -> None:
     ip("link", "set", vcan, "down")
     ip("link", "set", vcan, "mtu", "16")
     with pytest.raises(RunError, match=f"ip link set {vcan} mtu 72"), port_on(vcan, [], fd=True):
         pass
 
 
-def test_an_interface_that_is_down_is_refused_with_a_working_command(
+def test_interface_that_is_down_is_refused_with_a_working_command(
     vcan: str,
 ) -> None:
     ip("link", "set", vcan, "down")

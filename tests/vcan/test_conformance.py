@@ -24,7 +24,7 @@ def verdicts_in(text: str) -> dict[str, str]:
     return found
 
 
-def test_the_gateways_node_fulfils_all_items_of_the_report(vcan: str, tmp_path: Path) -> None:
+def test_gateways_node_fulfils_all_items_of_the_report(vcan: str, tmp_path: Path) -> None:
     with gateway_with_a_node(vcan, tmp_path):
         done = conformance(vcan)
     verdicts = verdicts_in(done.stdout)
@@ -40,7 +40,7 @@ def test_the_gateways_node_fulfils_all_items_of_the_report(vcan: str, tmp_path: 
 
 
 @pytest.mark.extended
-def test_a_slave_of_another_project_is_judged(vcan: str, tmp_path: Path) -> None:
+def test_slave_of_another_project_is_judged(vcan: str, tmp_path: Path) -> None:
     """The slave in JavaScript is complete, but not strict."""
     need(NODE_CANOPEN.is_dir(), "canopen for node")
     eds = tmp_path / "slave.eds"

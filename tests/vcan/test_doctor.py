@@ -56,7 +56,7 @@ def configured(folder: Path, interface: str, ports: list[PtyPort]) -> Path:
     return file
 
 
-def test_a_vcan_that_is_down_or_missing_is_an_error_with_the_remedy(
+def test_vcan_that_is_down_or_missing_is_an_error_with_the_remedy(
     vcan: str,
     tmp_path: Path,
     escs: list[PtyPort],
@@ -126,7 +126,7 @@ def shown(name: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def test_a_bundle_of_a_running_gateway_has_its_state_and_a_capture(
+def test_bundle_of_a_running_gateway_has_its_state_and_a_capture(
     vcan: str,
     tmp_path: Path,
 ) -> None:

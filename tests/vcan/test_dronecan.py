@@ -104,7 +104,7 @@ def check_statuses(ports: list[PtyPort], peer: Peer) -> None:
 
 
 @pytest.mark.parametrize("escs", [1, 4])
-def test_a_foreign_node_reads_status_info_and_parameters(
+def test_foreign_node_reads_status_info_and_parameters(
     vcan: str,
     start_gateway: Start,
     tmp_path: Path,
@@ -131,7 +131,7 @@ def test_a_foreign_node_reads_status_info_and_parameters(
 
 
 @pytest.mark.parametrize("escs", [1, 4])
-def test_a_foreign_allocator_sets_the_node_ids(
+def test_foreign_allocator_sets_the_node_ids(
     vcan: str,
     start_gateway: Start,
     tmp_path: Path,

@@ -71,7 +71,7 @@ def web(vcan: str, tmp_path: Path) -> Iterator[tuple[GatewayProcess, str]]:
     assert "Traceback" not in served.log
 
 
-def test_the_page_follows_gateway_esc_and_interface(
+def test_page_follows_gateway_esc_and_interface(
     vcan: str,
     escs: list[PtyPort],
     start_gateway: Start,
@@ -109,7 +109,7 @@ def test_the_page_follows_gateway_esc_and_interface(
     wait_for(is_valid, "values after the interface is up again")
 
 
-def test_a_missing_interface_is_told_at_the_start_and_on_the_page(tmp_path: Path) -> None:
+def test_missing_interface_is_told_at_the_start_and_on_the_page(tmp_path: Path) -> None:
     words = ("--listen", "127.0.0.1:0", "--cache", tmp_path / "cache")
     served = GatewayProcess(None, "nosuch0", *words, command="web")
     served.wait_for_line("shows nosuch0")
@@ -150,7 +150,7 @@ class LastFrame:
 @pytest.mark.extended
 @pytest.mark.skipif(PROGRAM is None, reason=MISSING)
 @pytest.mark.parametrize("lost", ["telemetry", "gateway"])
-def test_a_loss_is_shown_within_half_a_second_of_its_timeout(
+def test_loss_is_shown_within_half_a_second_of_its_timeout(
     vcan: str,
     escs: list[PtyPort],
     start_gateway: Start,

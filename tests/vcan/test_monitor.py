@@ -12,7 +12,7 @@ pytestmark = pytest.mark.promise("monitor")
 Start = Callable[..., GatewayProcess]
 
 
-def test_a_monitor_reports_a_lost_interface_and_recovers(
+def test_monitor_reports_a_lost_interface_and_recovers(
     vcan: str,
     escs: list[PtyPort],
     start_gateway: Start,

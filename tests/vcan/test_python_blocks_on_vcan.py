@@ -96,13 +96,13 @@ def test_every_python_block_is_run_or_needs_ros() -> None:
 
 
 @pytest.mark.parametrize("block", example("Battery voltage"), ids=lambda block: block.place)
-def test_the_example_polls_values(vcan: str, block: Block, tmp_path: Path) -> None:
+def test_example_polls_values(vcan: str, block: Block, tmp_path: Path) -> None:
     said = output_of(block, tmp_path)
     assert re.search(r"^voltage 2\d\.\d+ V$", said, re.MULTILINE)
     assert said.endswith("link 2\n") or "link" not in block.text
 
 
-def test_the_example_receives_pdos(vcan: str, tmp_path: Path) -> None:
+def test_example_receives_pdos(vcan: str, tmp_path: Path) -> None:
     (block,) = example("wait_for_reception")
     said = output_of(block, tmp_path).splitlines()
     assert len(said) == 15
@@ -114,7 +114,7 @@ def test_the_example_receives_pdos(vcan: str, tmp_path: Path) -> None:
     assert all(2000 < int(line.rpartition(" ")[2]) < 3000 for line in said if "voltage" in line)
 
 
-def test_the_example_receives_emergencies_and_reads_the_history(vcan: str, tmp_path: Path) -> None:
+def test_example_receives_emergencies_and_reads_the_history(vcan: str, tmp_path: Path) -> None:
     (block,) = example("emcy")
     said = output_of(block, tmp_path)
     assert re.search(r"^(2220|0000)h, error word", said, re.MULTILINE)
@@ -122,7 +122,7 @@ def test_the_example_receives_emergencies_and_reads_the_history(vcan: str, tmp_p
     assert "history 1: 2220h" in said
 
 
-def test_the_example_stores_settings_and_a_pdo_across_a_restart(vcan: str, tmp_path: Path) -> None:
+def test_example_stores_settings_and_a_pdo_across_a_restart(vcan: str, tmp_path: Path) -> None:
     (block,) = example("store()")
     output_of(block, tmp_path, after=AFTER_RESTART)
     stored = decode((tmp_path / "store" / "esc1.params").read_bytes())
@@ -131,13 +131,13 @@ def test_the_example_stores_settings_and_a_pdo_across_a_restart(vcan: str, tmp_p
     assert stored.communication[0x180401] == (0x400001A1).to_bytes(4, "little")
 
 
-def test_the_example_sets_the_node_id_of_a_waiting_node(vcan: str, tmp_path: Path) -> None:
+def test_example_sets_the_node_id_of_a_waiting_node(vcan: str, tmp_path: Path) -> None:
     (block,) = example("fast_scan")
     assert output_of(block, tmp_path, node_id=255).startswith("found True")
     assert decode((tmp_path / "store" / "esc1.params").read_bytes()).node_id == 5
 
 
-def test_the_test_of_a_receiver_runs_with_the_example(vcan: str, tmp_path: Path) -> None:
+def test_test_of_a_receiver_runs_with_the_example(vcan: str, tmp_path: Path) -> None:
     shutil.copytree(PROJECT / "examples", tmp_path / "examples")
     (block,) = (block for block in BLOCKS if block.place.startswith(f"{RECEIVER_PAGE}:"))
     folder = tmp_path / "examples" / "receiver"

@@ -65,7 +65,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("block", blocks("vcan"), ids=lambda block: block.place)
-def test_a_shell_block_can_be_typed_as_it_is(
+def test_shell_block_can_be_typed_as_it_is(
     vcan: str,
     block: Block,
     files: Path,

@@ -57,7 +57,7 @@ def test_without_venv_a_line_names_make_test_before_the_command_runs(
     )
 
 
-def test_the_programs_of_the_venv_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_programs_of_the_venv_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "/usr/bin:/home/me/bin")
     monkeypatch.setattr(sys, "prefix", "/clone/.venv")
     vm_run.extend_path()
@@ -76,7 +76,7 @@ def test_virtual_machines_take_the_cpus_in_turn(monkeypatch: pytest.MonkeyPatch)
         name.close()
 
 
-def test_a_virtual_machine_and_its_children_run_on_one_cpu() -> None:
+def test_virtual_machine_and_its_children_run_on_one_cpu() -> None:
     before = os.sched_getaffinity(0)
     code = "import os; print(len(os.sched_getaffinity(0)))"
     with vm_run.on_one_cpu():

@@ -105,7 +105,7 @@ def test_node_output_stores_parameters_and_plain_output_is_not_asked() -> None:
     assert names_of(gateway, "can0") == ["can0: memory node 5"]
 
 
-def test_a_further_output_sends_values_and_receives_commands(gateway: Gateway) -> None:
+def test_further_output_sends_values_and_receives_commands(gateway: Gateway) -> None:
     gateway.start(0)
     found = []
     for now in range(0, 4 * SECOND, SECOND // 10):
@@ -146,7 +146,7 @@ def test_another_device_with_ids_of_a_further_output_is_noticed(gateway: Gateway
         (0x581, "SDO responses of CANopen node 1"),
     ],
 )
-def test_a_dbc_message_with_a_cob_id_of_a_node_is_refused(
+def test_dbc_message_with_a_cob_id_of_a_node_is_refused(
     tmp_path: Path,
     number: int,
     said: str,

@@ -79,7 +79,7 @@ def _shown(folder: Path) -> dict[str, Any]:
     return found
 
 
-def test_a_new_first_field_changes_no_other_value(tmp_path: Path) -> None:
+def test_new_first_field_changes_no_other_value(tmp_path: Path) -> None:
     copy = shutil.copytree(
         PACKAGE,
         tmp_path / "kontronik_can_gw",
