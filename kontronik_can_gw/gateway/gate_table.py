@@ -26,6 +26,8 @@ UNLIMITED = 32
 class State(Enum):
     """A state of the way to the bus."""
 
+    __hash__ = object.__hash__  # an enumeration's own is slow, and the gate looks up rows by it
+
     CLOSED = "closed"
     OPENING = "opening"
     UNPROVEN = "unproven"
@@ -44,6 +46,8 @@ class State(Enum):
 
 class Event(Enum):
     """Something that happens to the way to the bus."""
+
+    __hash__ = object.__hash__  # as for ``State``
 
     OPENING = "a thread opens the interface"
     OPENED = "interface open"

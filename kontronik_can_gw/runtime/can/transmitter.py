@@ -137,7 +137,9 @@ class Transmitter:
             return self._send_first_frame(port, now)
         if gate.is_limited:
             return self._send_limited(port, now)
-        self.put(gateway.take_frames(now))
+        frames = gateway.take_frames(now)
+        if frames:
+            self.put(frames)
         if not gate.may_try(now):
             return None
         return self._send(port, None, now)
