@@ -37,7 +37,7 @@ def run_ignoring(script: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_test_that_does_not_ask_for_a_compiler_finds_none() -> None:
+def test_compiler_is_missing_in_a_test_that_does_not_ask_for_it() -> None:
     """So a machine without a compiler needs no run to show that such a test asks for one."""
     for name in PROGRAMS:
         done = subprocess.run([name, "--version"], capture_output=True, text=True, check=False)
@@ -46,7 +46,7 @@ def test_test_that_does_not_ask_for_a_compiler_finds_none() -> None:
             there(name)
 
 
-def test_test_that_asks_for_a_compiler_can_use_it(
+def test_compiler_is_usable_in_a_test_that_asks_for_it(
     c_compiler: Callable[..., str],
     tmp_path: Path,
 ) -> None:
@@ -68,7 +68,7 @@ def test_test_that_asks_for_a_compiler_can_use_it(
     ],
     ids=["in Python", "in C"],
 )
-def test_test_that_hangs_is_named_and_the_next_one_runs(
+def test_hanging_test_is_named_and_the_next_one_runs(
     hangs: str,
     options: list[str],
     name: str,

@@ -59,7 +59,7 @@ def test_recorded_values_are_right(file: Path) -> None:
         ("dialogues/sync_of_three.txt", "-> 382#581F", "-> 382#591F"),
     ],
 )
-def test_the_judge_finds_a_wrong_frame(tmp_path: Path, name: str, old: str, new: str) -> None:
+def test_judge_finds_a_wrong_frame(tmp_path: Path, name: str, old: str, new: str) -> None:
     file = tmp_path / name
     file.parent.mkdir()
     text = (HERE / name).read_text(encoding="utf-8")

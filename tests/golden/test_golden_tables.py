@@ -64,7 +64,7 @@ def rows_in(table: Path, prefix: str, names: Cells) -> Iterator[Cells]:
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_a_table_of_uart_bytes_has_exactly_the_frames(tmp_path: Path, flight: str) -> None:
+def test_table_of_uart_bytes_has_exactly_the_frames(tmp_path: Path, flight: str) -> None:
     stream = commands.flight_bytes(record.HERE / f"flights/{flight}.txt", 1)
     expected = expected_rows(stream)
     source = tmp_path / "in.bin"
@@ -76,7 +76,7 @@ def test_a_table_of_uart_bytes_has_exactly_the_frames(tmp_path: Path, flight: st
 
 
 @pytest.mark.parametrize("capture", CAPTURES, ids=lambda path: path.stem)
-def test_a_table_of_a_capture_has_frames_in_their_order(tmp_path: Path, capture: Path) -> None:
+def test_table_of_a_capture_has_frames_in_their_order(tmp_path: Path, capture: Path) -> None:
     """Frames that the gateway discarded, because they arrived too slowly, are not in it."""
     table = tmp_path / "out.csv"
     assert drive.command(["convert", "-q", str(capture), str(table)]) == 0

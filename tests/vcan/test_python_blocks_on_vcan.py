@@ -137,7 +137,7 @@ def test_example_sets_the_node_id_of_a_waiting_node(vcan: str, tmp_path: Path) -
     assert decode((tmp_path / "store" / "esc1.params").read_bytes()).node_id == 5
 
 
-def test_test_of_a_receiver_runs_with_the_example(vcan: str, tmp_path: Path) -> None:
+def test_receiver_is_tested_with_the_example(vcan: str, tmp_path: Path) -> None:
     shutil.copytree(PROJECT / "examples", tmp_path / "examples")
     (block,) = (block for block in BLOCKS if block.place.startswith(f"{RECEIVER_PAGE}:"))
     folder = tmp_path / "examples" / "receiver"
