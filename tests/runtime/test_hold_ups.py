@@ -441,7 +441,7 @@ def test_watchdog_is_fed_only_while_everything_is_served(
 ) -> None:
     world = World()
     fed: list[int] = []
-    signs = SimpleNamespace(present=True, watchdog_ns=500 * MS, ready=lambda _: None)
+    signs = SimpleNamespace(is_present=True, watchdog_ns=500 * MS, ready=lambda _: None)
     signs.status = signs.ready
     signs.watchdog = lambda: fed.append(world.now)
     escs = (EscSettings("esc1", timeout_ns=60 * SECOND),)
