@@ -38,7 +38,7 @@ class State(Enum):
     MOVING = "moving"
     LOST = "lost"
     QUIET = "quiet"
-    QUIET_BLOCKED = "quiet, blocked"
+    QUIET_BLOCKED = "quiet-blocked"
     BUS_OFF = "bus-off"
     SETTLING = "settling"
     RESTARTING = "restart asked"
