@@ -1,4 +1,4 @@
-"""Adds the output of outputs/voltages to the package, as the recipe of docs/design.md demands."""
+"""Adds the output of outputs/voltages to the package, as the recipe of docs/recipes.md demands."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""An output that follows the recipe of docs/design.md, and the calls of a NodeOutput.
+"""An output that follows the recipe of docs/recipes.md, and the calls of a NodeOutput.
 
 The output is in outputs/voltages. test_every_output.py tests it like the outputs of the package.
 """

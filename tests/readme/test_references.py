@@ -139,7 +139,8 @@ def _is_defined(file: str, name: str) -> bool:
 
 
 def test_functions_named_in_the_design_exist() -> None:
-    text = _CODE_BLOCK.sub("", (PROJECT / "docs/design.md").read_text(encoding="utf-8"))
+    pages = [PROJECT / "docs" / name for name in ("design.md", "recipes.md")]
+    text = _CODE_BLOCK.sub("", "".join(page.read_text(encoding="utf-8") for page in pages))
     text = re.sub(r"\s+", " ", text)
     references = [(file, name) for file, name in _FUNCTION.findall(text) if file or "." in name]
     is_code = re.compile(r"_?[A-Z]\w+\.\w+")

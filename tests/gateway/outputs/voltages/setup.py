@@ -1,7 +1,7 @@
 """An example of an output: one frame a second for each ESC, with its battery voltage.
 
 The value is in 10 mV, or FFFFh if not available. A CAN command changes the period. It follows the
-recipe "Add an output" of docs/design.md. Larger outputs have a module for the class.
+recipe "Add an output" of docs/recipes.md. Larger outputs have a module for the class.
 """
 
 from collections.abc import Mapping, Sequence
