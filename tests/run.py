@@ -124,7 +124,7 @@ STEPS = {
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
-    "test-all": (("masters", "faults"), ("tools", "prove", "cuts")),
+    "test-all": (("masters", "faults", "prove", "cuts"), ("tools",)),
     "prove": (("prove",),),
     "release": (
         (
