@@ -163,7 +163,7 @@ def _forms(scale: Scale, is_info: int) -> list[Any]:
             name=f"{'info' if is_info else 'live'}_{layout}",
             length=length,
             crc_part=slice(begin, covered),
-            data_type=tuple,
+            data_type=lambda *symbols: symbols,
             unpack_crc=lambda frame, at=length - 1: (scale.alphabet.index(chr(frame[at])),),
             unpack_fields=lambda frame, body=body: frame[body],
         )
