@@ -167,7 +167,8 @@ def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> 
             break
         source.pump(monitor.take, now + REFRESH_S)
     monitor.advance(source.now())
-    _look_for_quiet(source, monitor)
+    if not monitor.view.frames and not source.is_file:
+        monitor.is_quiet = is_quiet_on(source.name, source.now())
     if not monitor.view.frames and not monitor.is_quiet and not stopped():
         file = monitor.file
         name = source.name
