@@ -45,9 +45,9 @@ def watch(source: Source, monitor: Monitor, stopped: Stopped) -> None:
         _lines(source, monitor, stopped)
 
 
-def _look_for_quiet(source: Source, monitor: Monitor) -> None:
-    """Ask the gateways of this machine whether one is quiet, if the bus is silent."""
-    if not source.is_file and monitor.silent_ns >= SILENCE_NS and not monitor.is_quiet:
+def _look_for_quiet(source: Source, monitor: Monitor, silence_ns: int = SILENCE_NS) -> None:
+    """Ask the gateways of this machine whether one is quiet, if the bus is silent for so long."""
+    if not source.is_file and monitor.silent_ns >= silence_ns and not monitor.is_quiet:
         monitor.is_quiet = is_quiet_on(source.name, source.now())
 
 
@@ -167,8 +167,8 @@ def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> 
             break
         source.pump(monitor.take, now + REFRESH_S)
     monitor.advance(source.now())
-    if not monitor.view.frames and not source.is_file:
-        monitor.is_quiet = is_quiet_on(source.name, source.now())
+    if not monitor.view.frames:
+        _look_for_quiet(source, monitor, 0)
     if not monitor.view.frames and not monitor.is_quiet and not stopped():
         file = monitor.file
         name = source.name
