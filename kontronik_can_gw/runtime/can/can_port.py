@@ -134,7 +134,7 @@ class CanPort(ABC):
             self.state = CanState.DOWN
             return 0, Sent.GONE
         count, answer = self._send_each(frames, clock, latest)
-        if count and (self.state in (CanState.DOWN, CanState.UNKNOWN)):
+        if count and self.state in (CanState.DOWN, CanState.UNKNOWN):
             self.state = CanState.ERROR_ACTIVE
         if answer in (Sent.DOWN, Sent.GONE):
             self.state = CanState.DOWN
