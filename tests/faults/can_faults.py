@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from functools import partial
 
 from beds import ADAPTER_RATE, BUS, adapters, eight, fault, make_pair, parked, run
-from bus_watch import SECOND
+from bus_watch import SECOND, TIMEOUT_NS
 from harness import Bench, Injection, PtyPort
 from raw_bus import ERROR_FLAG, RawBus
 from slcan_adapters import Adapter
@@ -33,7 +33,9 @@ BUS_OFF_LEFT = 0x8140
 MAX_IN_CONTROLLER = 6
 """Frames in the kernel that cannot be taken back: the capacity of its smallest send buffer."""
 SLOW_BITS_PER_S = 24_000
-HELD_NS = MAX_IN_CONTROLLER * 16 * 8 * SECOND // SLOW_BITS_PER_S
+BITS_OF_FRAME = 16 * 8
+"""Bits of a frame in the kernel, which limits the rate of these."""
+HELD_NS = MAX_IN_CONTROLLER * BITS_OF_FRAME * SECOND // SLOW_BITS_PER_S
 """Duration of these frames of 16 bytes on such a slow bus: 32 ms."""
 FREE = "1gbit"
 on_cable = partial(fault, "CAN", limit_s=1.0)
@@ -120,17 +122,19 @@ def park(bench: Bench, injection: Injection, seconds: float) -> None:
 
 
 @contextlib.contextmanager
-def slow_bus(injection: Injection, rate: str, held_ns: int) -> Iterator[None]:
+def slow_bus(
+    injection: Injection, rate: str, held_ns: int, burst_and_limit: str = "burst 160 limit 160"
+) -> Iterator[None]:
     """Limit the bus to a rate within the block.
 
-    The kernel's queue is full soon, and sending fails with ENOBUFS. When the bus is free again, the
-    kernel still sends the frames in its queue. Until then values may be late by ``held_ns``,
-    because frames in the kernel cannot be taken back.
+    With this limit, the kernel's queue is full soon, and sending fails with ENOBUFS. When the bus
+    is free again, the kernel still sends the frames in its queue. Until then values may be late by
+    ``held_ns``, because frames in the kernel cannot be taken back.
     """
     interface = injection.bench.interface
     watch = injection.bench.watch
     watch.more_ns = held_ns
-    run(f"tc qdisc add dev {interface} root tbf rate {rate} burst 160 limit 160")
+    run(f"tc qdisc add dev {interface} root tbf rate {rate} {burst_and_limit}")
     yield
     run(f"tc qdisc change dev {interface} root tbf rate {FREE} burst 160 limit 160")
     with RawBus(interface) as near:
@@ -148,6 +152,33 @@ def no_buffers(bench: Bench, injection: Injection, seconds: float) -> None:
     """The values on the bus are fresh, except for frames that were in the kernel."""
     with slow_bus(injection, f"{SLOW_BITS_PER_S}bit", HELD_NS):
         time.sleep(seconds)
+
+
+@on_cable("a slow bus: 40 and 10 frames/s leave", settle_s=1, rounds=(40, 10))
+def slow(bench: Bench, injection: Injection, rate: int) -> None:
+    """No value is older than its timeout, a quarter of it and the time of one frame.
+
+    Only the frames that were under way at the slow-down may be older. Nothing is restarted.
+    """
+    frame_ns = SECOND // rate
+    first_ns = (MAX_IN_CONTROLLER + 1) * frame_ns
+    watch = bench.watch
+    lines = len(bench.gateway.lines)
+    booted = len(watch.boot_ups)
+    with slow_bus(injection, f"{BITS_OF_FRAME * rate}bit", first_ns, "burst 16 limit 16000"):
+        bench.wait_log("the bus is slow", lines)
+        time.sleep(first_ns / SECOND)
+        watch.catch_up()
+        watch.more_ns = TIMEOUT_NS // 4 + frame_ns
+        right = watch.values
+        time.sleep(6)
+        bench.expect(watch.values > right, "no values arrived while the bus was slow")
+    bench.wait_log("the bus takes all frames in time", lines)
+    injection.leave_out_until(time.monotonic_ns())  # more frames are allowed only step by step
+    said = "\n".join(bench.gateway.lines[lines:])
+    bench.expect(said.count("the bus is slow") == 1, "the log does not say once that it is slow")
+    bench.expect("restart" not in said, "the interface was restarted")
+    bench.expect(len(watch.boot_ups) == booted, "a node booted")
 
 
 @on_cable("a bus 100 % loaded by others", settle_s=1, rounds=[4])
