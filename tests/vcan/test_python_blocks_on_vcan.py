@@ -1,4 +1,4 @@
-"""Python blocks of README and docs run as printed, against a gateway on can0."""
+"""Python blocks of the docs run as printed, against a gateway on can0."""
 
 import re
 import shutil
@@ -92,7 +92,7 @@ def test_every_python_block_is_run_or_needs_ros() -> None:
     run = {block.place for block in EXAMPLES}
     others = {block.place.partition(":")[0] for block in BLOCKS if block.place not in run}
     assert others == {RECEIVER_PAGE, NEEDS_ROS}
-    assert {place.partition(":")[0] for place in run} == {"README.md", "docs/canopen.md"}
+    assert {place.partition(":")[0] for place in run} == {"docs/canopen.md"}
 
 
 @pytest.mark.parametrize("block", example("Battery voltage"), ids=lambda block: block.place)
