@@ -25,7 +25,7 @@ def table() -> list[str]:
 
 
 def test_table_of_the_gate_in_the_docs_is_the_one_of_the_code() -> None:
-    lines = DESIGN.read_text().splitlines()
+    lines = [*DESIGN.read_text().splitlines(), ""]
     begin = lines.index(HEAD[0])
     end = begin + lines[begin:].index("")
     assert lines[begin:end] == table()

@@ -139,7 +139,7 @@ def _is_defined(file: str, name: str) -> bool:
 
 
 def test_functions_named_in_the_design_exist() -> None:
-    pages = [PROJECT / "docs" / name for name in ("design.md", "recipes.md")]
+    pages = [PROJECT / "docs" / name for name in ("design.md", "decisions.md", "recipes.md")]
     text = _CODE_BLOCK.sub("", "".join(page.read_text(encoding="utf-8") for page in pages))
     text = re.sub(r"\s+", " ", text)
     references = [(file, name) for file, name in _FUNCTION.findall(text) if file or "." in name]
