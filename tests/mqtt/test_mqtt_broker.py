@@ -131,7 +131,9 @@ def connecting(broker: MqttConfig) -> Iterator[MqttClient]:
     try:
         yield client
     finally:
+        begin = time.monotonic()
         client.stop(PATIENCE)
+        assert time.monotonic() - begin < PATIENCE, "its thread did not report the end"
 
 
 def to(port: int) -> MqttConfig:

@@ -65,6 +65,8 @@ class _Client(paho.Client):
     """
 
     on_malformed: Callable[[str], None]
+    on_end: Callable[[], None]
+    """Called when the thread ends. paho does not call ``on_disconnect`` after each problem."""
 
     def _sock_recv(self, size: int) -> bytes:
         """Receive at most ``size`` bytes of one packet: its first byte, its length, its body."""
@@ -79,7 +81,9 @@ class _Client(paho.Client):
         """Connect and serve until ``disconnect``."""
         while True:
             try:
-                return super().loop_forever(timeout, retry_first_connection)
+                code = super().loop_forever(timeout, retry_first_connection)
+                self.on_end()
+                return code
             except Exception as error:
                 if isinstance(error, _Unexpected):
                     problem = "sends packets that no publisher expects"
@@ -127,6 +131,7 @@ class MqttClient:
         self._faults = FaultLog()
         client = _Client(CallbackAPIVersion.VERSION2, client_id)
         client.on_malformed = self._on_malformed
+        client.on_end = self._ended.set
         client.on_pre_connect = self._on_pre_connect
         client.on_socket_open = self._on_socket_open
         client.on_connect = self._on_connect
@@ -255,7 +260,6 @@ class MqttClient:
             )
             return
         self._connections += 1
-        self._ended.clear()
         self.problem = ""
 
     def _on_malformed(self, problem: str) -> None:
@@ -275,7 +279,6 @@ class MqttClient:
             self.problem = (
                 "does not answer like an MQTT broker. Is the port right? Does it need mqtt.tls?"
             )
-        self._ended.set()
 
 
 def _is_done(info: paho.MQTTMessageInfo) -> bool:
