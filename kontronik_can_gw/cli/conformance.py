@@ -9,9 +9,9 @@ from kontronik_can_gw.cli.output import check_output, write_output
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.conformance.bench import slave_on_bus
 from kontronik_can_gw.desk.conformance.eds_file import read_eds
-from kontronik_can_gw.desk.conformance.items import Item
 from kontronik_can_gw.desk.conformance.run import (
     GATEWAY_DEVIATIONS,
+    Item,
     ItemVerdict,
     Result,
     all_items,

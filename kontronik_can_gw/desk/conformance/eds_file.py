@@ -10,6 +10,7 @@ import logging
 import re
 from collections.abc import Iterator
 from configparser import NoOptionError
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -72,7 +73,10 @@ def _problems(sections: dict[str, Section]) -> Iterator[str]:
         if match[1] not in sections and match[1] not in missing:
             missing.add(match[1])
             yield f"[{section.name}] there is no section [{match[1].upper()}]. Add it."
-        if (match[2] or _is_variable(section)) and not section.get("DataType"):
+        is_variable = False
+        with suppress(ValueError):  # reported as a wrong number
+            is_variable = section.number("ObjectType", 7) in _VARIABLES
+        if (match[2] or is_variable) and not section.get("DataType"):
             yield f"[{section.name}] DataType: missing. Add it."
 
 
@@ -88,13 +92,6 @@ def _wrong_numbers(name: str, section: Section) -> Iterator[str]:
             section.number(written)
         except ValueError as error:
             yield f"[{section.name}] {error}"
-
-
-def _is_variable(section: Section) -> bool:
-    try:
-        return section.number("ObjectType", 7) in _VARIABLES
-    except ValueError:  # reported as a wrong number
-        return False
 
 
 def _dictionary(path: Path, sections: dict[str, Section], node_id: int) -> "ObjectDictionary":

@@ -2,7 +2,7 @@
 
 from kontronik_can_gw.canopen.eds import OBJECT
 from kontronik_can_gw.desk.conformance.eds_file import LISTS, section_of
-from kontronik_can_gw.desk.conformance.items import item, require
+from kontronik_can_gw.desk.conformance.items import require
 from kontronik_can_gw.desk.conformance.slave import Slave
 
 _SECTIONS = ("FileInfo", "DeviceInfo", *LISTS)
@@ -12,7 +12,6 @@ _RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 _LONGEST_NAME = 241
 
 
-@item("CiA 306 (test tool EDS checker 01)", "sections of the EDS", ", ".join(_SECTIONS))
 def eds_sections(slave: Slave) -> str:
     missing = [name for name in _SECTIONS if name.lower() not in slave.eds]
     required = [name for name in missing if name not in ("OptionalObjects", "ManufacturerObjects")]
@@ -30,11 +29,6 @@ def _listed(slave: Slave) -> dict[str, list[int]]:
     return found
 
 
-@item(
-    "CiA 306",
-    "the lists of objects",
-    "SupportedObjects is their number, each object is in one list and has a section",
-)
 def eds_lists_of_objects(slave: Slave) -> str:
     total: list[int] = []
     for name, indices in _listed(slave).items():
@@ -50,7 +44,6 @@ def eds_lists_of_objects(slave: Slave) -> str:
     return f"{len(total)} objects"
 
 
-@item("CiA 301, 7.5.2; CiA 306", "mandatory objects", "1000h, 1001h and 1018h")
 def eds_mandatory_objects(slave: Slave) -> str:
     missing = [f"{index:04X}h" for index in _MANDATORY if index not in slave.dictionary]
     require(not missing, f"missing: {', '.join(missing)}")
@@ -60,11 +53,6 @@ def eds_mandatory_objects(slave: Slave) -> str:
     return "all three"
 
 
-@item(
-    "CiA 306",
-    "keys of each object",
-    "ParameterName of at most 241 characters, AccessType of each variable",
-)
 def eds_keys_of_objects(slave: Slave) -> str:
     sections = [section for name, section in slave.eds.items() if OBJECT.match(name)]
     wrong = []
@@ -78,11 +66,6 @@ def eds_keys_of_objects(slave: Slave) -> str:
     return f"{len(sections)} sections"
 
 
-@item(
-    "CiA 306",
-    "NrOfTXPDO and NrOfRXPDO of [DeviceInfo]",
-    "the numbers of 18xxh and 14xxh objects",
-)
 def eds_numbers_of_pdos(slave: Slave) -> str:
     info = section_of(slave.eds, "DeviceInfo")
     answers = []
@@ -94,7 +77,6 @@ def eds_numbers_of_pdos(slave: Slave) -> str:
     return ", ".join(answers)
 
 
-@item("CiA 306", "BaudRate entries of [DeviceInfo]", "at least one bit rate is supported")
 def eds_bit_rates(slave: Slave) -> str:
     info = section_of(slave.eds, "DeviceInfo")
     rates = [rate for rate in _RATES if info.number(f"BaudRate_{rate}")]

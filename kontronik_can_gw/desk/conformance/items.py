@@ -1,16 +1,13 @@
-"""The items of a conformance test, and how one item ends.
+"""How an item of the conformance test ends.
 
-An item is a function with the decorator ``item``. It stimulates the slave and returns the observed
-answer as text. It raises Wrong for an answer that the standard does not allow, and Skipped if the
-slave does not have the service.
+The procedure of an item stimulates the slave and returns the observed answer as text. It raises
+Wrong for an answer that the standard does not allow, and Skipped if the slave does not have the
+service. The texts of the items are in items.toml.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
-from kontronik_can_gw.desk.conformance.slave import AbortedTransfer, Slave
-
-Procedure = Callable[[Slave], str]
+from kontronik_can_gw.desk.conformance.slave import AbortedTransfer
 
 
 class Wrong(Exception):
@@ -19,36 +16,6 @@ class Wrong(Exception):
 
 class Skipped(Exception):
     """The item does not apply to this slave. The text is the reason."""
-
-
-class Item(NamedTuple):
-    """One item of the test."""
-
-    name: str
-    """Name in reports and in the file of deviations, for example "sdo-toggle-bit"."""
-    clause: str
-    stimulus: str
-    expected: str
-    run: Procedure
-    needs: str
-    """Item that shows that the slave has the service whose silence this item requires, or ""."""
-
-
-ITEMS: list[Item] = []
-"""All items. The modules of the items add to it when they are imported."""
-
-
-def item(
-    clause: str, stimulus: str, expected: str, *, needs: str = ""
-) -> Callable[[Procedure], Procedure]:
-    """Add a function to the items. Its name becomes the name of the item."""
-
-    def add(procedure: Procedure) -> Procedure:
-        name = procedure.__name__.replace("_", "-")
-        ITEMS.append(Item(name, clause, stimulus, expected, procedure, needs))
-        return procedure
-
-    return add
 
 
 def require(condition: bool, answer: str) -> None:

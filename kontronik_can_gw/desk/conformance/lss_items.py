@@ -1,7 +1,7 @@
 """Layer setting services: CiA 305."""
 
 from kontronik_can_gw.desk.conformance.eds_file import section_of
-from kontronik_can_gw.desk.conformance.items import Skipped, Wrong, item, require
+from kontronik_can_gw.desk.conformance.items import Skipped, Wrong, require
 from kontronik_can_gw.desk.conformance.nmt_items import RESET_COMMUNICATION, RESET_NODE
 from kontronik_can_gw.desk.conformance.slave import RESET_S, NoAnswer, ReceivedFrame, Slave
 
@@ -61,7 +61,6 @@ def _bytes(value: int) -> bytes:
     return value.to_bytes(4, "little")
 
 
-@item("CiA 305", "switch state global to configuration", "no answer", needs="lss-inquire-node-id")
 def lss_switch_global(slave: Slave) -> str:
     _begin(slave)
     _switch(slave, _CONFIGURATION)
@@ -71,7 +70,6 @@ def lss_switch_global(slave: Slave) -> str:
     return "no answer"
 
 
-@item("CiA 305", "inquire identity: vendor-ID, product, revision, serial number", "as in 1018h")
 def lss_inquire_identity(slave: Slave) -> str:
     _begin(slave)
     identity = _identity(slave)
@@ -85,7 +83,6 @@ def lss_inquire_identity(slave: Slave) -> str:
     return ", ".join(f"{value:08X}h" for value in identity)
 
 
-@item("CiA 305", "inquire node-ID", "the node-ID")
 def lss_inquire_node_id(slave: Slave) -> str:
     _begin(slave)
     _switch(slave, _CONFIGURATION)
@@ -95,7 +92,6 @@ def lss_inquire_node_id(slave: Slave) -> str:
     return str(answer[1])
 
 
-@item("CiA 305", "inquire node-ID in state waiting", "no answer", needs="lss-inquire-node-id")
 def lss_silent_while_waiting(slave: Slave) -> str:
     _begin(slave)
     _send(slave, _INQUIRE_NODE_ID)
@@ -108,7 +104,6 @@ def _select(slave: Slave, identity: list[int]) -> None:
         _send(slave, _SWITCH_SELECTIVE + number, _bytes(value))
 
 
-@item("CiA 305", "switch state selective with the identity", "answer 44h")
 def lss_switch_selective(slave: Slave) -> str:
     _begin(slave)
     identity = _identity(slave)
@@ -119,12 +114,6 @@ def lss_switch_selective(slave: Slave) -> str:
     return "44h"
 
 
-@item(
-    "CiA 305",
-    "switch state selective with another serial number",
-    "no answer",
-    needs="lss-switch-selective",
-)
 def lss_switch_selective_of_another_slave(slave: Slave) -> str:
     _begin(slave)
     identity = _identity(slave)
@@ -135,7 +124,6 @@ def lss_switch_selective_of_another_slave(slave: Slave) -> str:
     return "no answer"
 
 
-@item("CiA 305", "identify remote slaves, in and out of the range of the slave", "4Fh, no answer")
 def lss_identify(slave: Slave) -> str:
     _begin(slave)
     vendor, product, revision, serial = _identity(slave)
@@ -154,7 +142,6 @@ def lss_identify(slave: Slave) -> str:
     return "4Fh, no answer"
 
 
-@item("CiA 305", "configure node-ID 0 and 128", "error code 1")
 def lss_invalid_node_id(slave: Slave) -> str:
     _begin(slave)
     _switch(slave, _CONFIGURATION)
@@ -164,7 +151,6 @@ def lss_invalid_node_id(slave: Slave) -> str:
     return "error code 1 twice"
 
 
-@item("CiA 305", "configure a bit timing that does not exist (table 0, index 200)", "an error code")
 def lss_invalid_bit_timing(slave: Slave) -> str:
     _begin(slave)
     _switch(slave, _CONFIGURATION)
@@ -175,11 +161,6 @@ def lss_invalid_bit_timing(slave: Slave) -> str:
     return f"error code {answer[1]}"
 
 
-@item(
-    "CiA 305",
-    "configure another node-ID, then reset communication; then the old node-ID again",
-    "the boot-up message of the new and of the old node-ID",
-)
 def lss_configure_node_id(slave: Slave) -> str:
     _begin(slave)
     old = slave.node_id
@@ -200,11 +181,6 @@ def lss_configure_node_id(slave: Slave) -> str:
     return f"boot-up of node {new}, then of node {old}"
 
 
-@item(
-    "CiA 305",
-    "node-ID 255 and reset communication; fastscan; then the old node-ID",
-    "silence, the identity by fastscan, a boot-up message with the node-ID",
-)
 def lss_fastscan(slave: Slave) -> str:
     _begin(slave)
     identity = _identity(slave)
@@ -278,7 +254,6 @@ def _give_back_node_id(slave: Slave) -> None:
         raise Wrong("no boot-up message after the node-ID was configured") from None
 
 
-@item("CiA 305", "store configuration", "error code 0, or 1 if the slave cannot store")
 def lss_store(slave: Slave) -> str:
     _begin(slave)
     _switch(slave, _CONFIGURATION)

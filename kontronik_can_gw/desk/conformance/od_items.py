@@ -1,15 +1,14 @@
 """The object dictionary: CiA 301, 7.4.7 and 7.5.2, and its description in the EDS."""
 
-from kontronik_can_gw.desk.conformance.items import item, require
+from kontronik_can_gw.desk.conformance.items import require
 from kontronik_can_gw.desk.conformance.sdo_items import (
     NO_OBJECT,
-    encoded,
     is_number,
     is_readable,
     is_writable,
     name_of,
 )
-from kontronik_can_gw.desk.conformance.slave import AbortedTransfer, Slave
+from kontronik_can_gw.desk.conformance.slave import AbortedTransfer, Slave, encoded
 
 _NOT_NOW = (0x08000020, 0x08000021, 0x08000022, 0x08000024)
 """Abort codes of an object that exists, but whose value is not available at present."""
@@ -18,11 +17,6 @@ _HISTORY = 0x1003
 _COMMUNICATION = range(0x1000, 0x2000)
 
 
-@item(
-    "CiA 301, 7.4.7; CiA 306",
-    "upload of each readable object of the EDS",
-    "as many bytes as the data type has, or an abort because there is no value",
-)
 def od_each_object_can_be_read(slave: Slave) -> str:
     read = 0
     not_now = 0
@@ -44,11 +38,6 @@ def od_each_object_can_be_read(slave: Slave) -> str:
     return f"{read} read, {not_now} without a value at present"
 
 
-@item(
-    "CiA 301, 7.3.2.2; CiA 306 (test tool OD 02, OD 08)",
-    "upload of each communication object and constant with a DefaultValue, after a reset",
-    "the default of the EDS",
-)
 def od_values_are_the_defaults_of_the_eds(slave: Slave) -> str:
     compared = 0
     wrong = []
@@ -67,11 +56,6 @@ def od_values_are_the_defaults_of_the_eds(slave: Slave) -> str:
     return f"{compared} values are equal"
 
 
-@item(
-    "CiA 301, 7.4.7",
-    "sub-index 0 of each record and array",
-    "the highest sub-index that the EDS has",
-)
 def od_highest_sub_index(slave: Slave) -> str:
     from canopen.objectdictionary import ODVariable
 
@@ -91,11 +75,6 @@ def od_highest_sub_index(slave: Slave) -> str:
     return f"{compared} are right"
 
 
-@item(
-    "CiA 306",
-    "upload of each index from 1000h to 1FFFh that the EDS does not have",
-    "abort 06020000h",
-)
 def od_no_communication_object_beyond_the_eds(slave: Slave) -> str:
     tried = 0
     wrong = []
@@ -113,7 +92,6 @@ def od_no_communication_object_beyond_the_eds(slave: Slave) -> str:
     return f"{tried} aborts 06020000h"
 
 
-@item("CiA 301, 1018h", "identity of the device", "the values of [DeviceInfo] in the EDS")
 def od_identity(slave: Slave) -> str:
     info = slave.dictionary.device_information
     known = {
@@ -132,7 +110,6 @@ def od_identity(slave: Slave) -> str:
     return ", ".join(seen)
 
 
-@item("CiA 301, 1018h:1", "vendor-ID", "a number that CiA assigned, so not 0")
 def od_vendor_id_is_assigned(slave: Slave) -> str:
     value = slave.number(0x1018, 1)
     require(value != 0, "00000000h")

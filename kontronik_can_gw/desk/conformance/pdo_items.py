@@ -3,7 +3,7 @@
 from functools import partial
 from typing import TYPE_CHECKING
 
-from kontronik_can_gw.desk.conformance.items import Skipped, item, require, require_abort
+from kontronik_can_gw.desk.conformance.items import Skipped, require, require_abort
 from kontronik_can_gw.desk.conformance.nmt_items import ENTER_PRE_OPERATIONAL, START, STOP
 from kontronik_can_gw.desk.conformance.sdo_items import (
     NO_OBJECT,
@@ -28,8 +28,6 @@ _CANNOT_BE_MAPPED = 0x06040041
 _TOO_LONG = 0x06040042
 _RESERVED_TYPES = (241, 245, 251)
 _OTHER_SYNC = 0x0FE
-_POSITIVE = "pdo-each-sync"
-"""The item that shows that the slave sends its first TPDO."""
 _LIMITS = (VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW)
 
 
@@ -109,7 +107,6 @@ def _can_be_mapped(variable: "ODVariable") -> bool:
     return variable.pdo_mappable and is_sent and is_number(variable)
 
 
-@item("CiA 301, 7.2.2", "type 1 and 10 SYNCs in OPERATIONAL", "10 TPDOs, as long as the mapping")
 def pdo_each_sync(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.enable(1)
@@ -122,7 +119,6 @@ def pdo_each_sync(slave: Slave) -> str:
     return f"10 TPDOs of {len(frame.data)} bytes"
 
 
-@item("CiA 301, 7.2.2", "type 3 and 12 SYNCs in OPERATIONAL", "4 TPDOs")
 def pdo_each_third_sync(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.enable(3)
@@ -132,12 +128,6 @@ def pdo_each_third_sync(slave: Slave) -> str:
     return "4 TPDOs"
 
 
-@item(
-    "CiA 301, 7.2.2 (test tool PDO 07)",
-    "type 0 (acyclic) and 5 SYNCs in OPERATIONAL",
-    "no TPDO without a SYNC, and at most one for each SYNC",
-    needs=_POSITIVE,
-)
 def pdo_acyclic(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.enable(0)
@@ -149,7 +139,6 @@ def pdo_acyclic(slave: Slave) -> str:
     return f"{count} TPDOs after 5 SYNCs; only a changed value needs one"
 
 
-@item("CiA 301, 7.2.2", "TPDO disabled by bit 31, and SYNCs", "no TPDO", needs=_POSITIVE)
 def pdo_disabled(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.enable(1)
@@ -160,7 +149,6 @@ def pdo_disabled(slave: Slave) -> str:
     return "no TPDO"
 
 
-@item("CiA 301, 7.3.2.2", "type 1 and SYNCs in PRE-OPERATIONAL", "no TPDO", needs=_POSITIVE)
 def pdo_none_in_pre_operational(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.enable(1)
@@ -170,12 +158,6 @@ def pdo_none_in_pre_operational(slave: Slave) -> str:
     return "no TPDO"
 
 
-@item(
-    "CiA 301, 7.3.2.2 (test tool State 04)",
-    "type 1, NMT stop, and SYNCs while STOPPED",
-    "no TPDO",
-    needs=_POSITIVE,
-)
 def pdo_none_while_stopped(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.enable(1)
@@ -190,11 +172,6 @@ def pdo_none_while_stopped(slave: Slave) -> str:
     return "no TPDO"
 
 
-@item(
-    "CiA 301, 1800h:5",
-    "transmission type 254 with an event timer of 100 ms",
-    "at least 8 TPDOs a second",
-)
 def pdo_event_timer(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     if not slave.has(_COMMUNICATION, 5):
@@ -207,7 +184,6 @@ def pdo_event_timer(slave: Slave) -> str:
     return f"{count} TPDOs in a second"
 
 
-@item("CiA 301, 1800h:1", "new COB-ID while the TPDO is valid", "abort")
 def pdo_cob_id_change_while_valid(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.enable(1)
@@ -217,7 +193,6 @@ def pdo_cob_id_change_while_valid(slave: Slave) -> str:
     return answer
 
 
-@item("CiA 301, 7.3.5", "restricted COB-IDs 000h, 001h, 580h + node-ID, 6E0h and 7FFh", "abort")
 def pdo_restricted_cob_ids(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     answer = ""
@@ -228,7 +203,6 @@ def pdo_restricted_cob_ids(slave: Slave) -> str:
     return f"{answer} each"
 
 
-@item("CiA 301, 1800h:1", "29-bit COB-ID", "accepted, or abort 06090030h")
 def pdo_extended_cob_id(slave: Slave) -> str:
     FirstTpdo(slave)
     new = _INVALID | _NO_RTR | _EXTENDED | 0x12345
@@ -239,7 +213,6 @@ def pdo_extended_cob_id(slave: Slave) -> str:
             raise Skipped("the slave supports 29-bit COB-IDs")
 
 
-@item("CiA 301, 1800h:2", "reserved transmission types 241, 245 and 251", "abort")
 def pdo_reserved_types(slave: Slave) -> str:
     FirstTpdo(slave)
     answer = ""
@@ -248,7 +221,6 @@ def pdo_reserved_types(slave: Slave) -> str:
     return f"{answer} each"
 
 
-@item("CiA 301, 1800h:2", "types 252 and 253 (on a remote frame)", "accepted, or abort 06090030h")
 def pdo_remote_types(slave: Slave) -> str:
     FirstTpdo(slave)
     answers = []
@@ -263,12 +235,6 @@ def pdo_remote_types(slave: Slave) -> str:
     return f"252: {answers[0]}, 253: {answers[1]}"
 
 
-@item(
-    "CiA 301, 1800h:3",
-    "transmission type 254 with an event timer of 20 ms and an inhibit time of 100 ms",
-    "at most 12 TPDOs a second",
-    needs="pdo-event-timer",
-)
 def pdo_inhibit_time(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     if not (slave.has(_COMMUNICATION, 3) and slave.has(_COMMUNICATION, 5)):
@@ -282,7 +248,6 @@ def pdo_inhibit_time(slave: Slave) -> str:
     return f"{count} TPDOs in a second"
 
 
-@item("CiA 301, 1800h:3", "new inhibit time while the TPDO is valid", "abort")
 def pdo_inhibit_time_while_valid(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     if not slave.has(_COMMUNICATION, 3):
@@ -291,7 +256,6 @@ def pdo_inhibit_time_while_valid(slave: Slave) -> str:
     return require_abort(lambda: slave.write_number(_COMMUNICATION, 3, 50))
 
 
-@item("CiA 301, 1A00h", "new mapping entry while sub-index 0 is not 0", "abort, nothing changes")
 def pdo_mapping_while_active(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.require_writable_mapping()
@@ -303,11 +267,6 @@ def pdo_mapping_while_active(slave: Slave) -> str:
     return answer
 
 
-@item(
-    "CiA 301, 1A00h (test tool PDO 22)",
-    "mapping procedure: disable, number 0, new entry, number 1, enable; then a SYNC",
-    "a TPDO with the bytes of the new object only",
-)
 def pdo_mapping_procedure(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     target = tpdo.map_object()
@@ -332,18 +291,15 @@ def _refused_entry(slave: Slave, entry: int, *codes: int) -> str:
     return require_abort(map_it, *codes)
 
 
-@item("CiA 301, 1A00h", "mapping of an object that does not exist", "abort 06020000h or 06040041h")
 def pdo_mapping_of_no_object(slave: Slave) -> str:
     index = next(index for index in range(0x5FFF, 0x2000, -1) if index not in slave.dictionary)
     return _refused_entry(slave, index << 16 | 0x08, NO_OBJECT, _CANNOT_BE_MAPPED)
 
 
-@item("CiA 301, 1A00h", "mapping of an object without PDO mapping", "abort 06040041h")
 def pdo_mapping_of_an_unmappable_object(slave: Slave) -> str:
     return _refused_entry(slave, 0x1000_00_20, _CANNOT_BE_MAPPED)
 
 
-@item("CiA 301, 1A00h", "mapping of more than 8 bytes", "abort 06040042h")
 def pdo_mapping_too_long(slave: Slave) -> str:
     tpdo = FirstTpdo(slave)
     tpdo.require_writable_mapping()
@@ -363,29 +319,20 @@ def pdo_mapping_too_long(slave: Slave) -> str:
     return require_abort(map_three, _TOO_LONG)
 
 
-@item("CiA 301, 1019h", "SYNC counter overflow of 1 and 241", "abort 06090030h")
 def sync_counter_range(slave: Slave) -> str:
-    if not slave.has(0x1019):
-        raise Skipped("the EDS does not have 1019h")
     answer = ""
     for value in (1, 241):
         answer = require_abort(partial(slave.write_number, 0x1019, 0, value), *_LIMITS)
     return f"{answer} each"
 
 
-@item("CiA 301, 1005h", "SYNC producer bit for a slave that is only a consumer", "abort")
 def sync_producer_is_refused(slave: Slave) -> str:
-    if not slave.has(0x1005):
-        raise Skipped("the EDS does not have 1005h")
     if slave.has(0x1006):
         raise Skipped("the slave can produce SYNC (1006h)")
     return require_abort(lambda: slave.write_number(0x1005, 0, _NO_RTR | 0x80))
 
 
-@item("CiA 301, 1005h", "1005h = 0FEh, then SYNCs with 080h and 0FEh", "a TPDO only after 0FEh")
 def sync_cob_id(slave: Slave) -> str:
-    if not slave.has(0x1005):
-        raise Skipped("the EDS does not have 1005h")
     variable = slave.variable(0x1005)
     if variable is None or not is_writable(variable):
         raise Skipped("1005h cannot be written")

@@ -2,13 +2,13 @@
 
 import tomllib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
-from kontronik_can_gw.desk.conformance import (  # these modules add their items
+from kontronik_can_gw.desk.conformance import (
     eds_items,
     emergency_items,
     lss_items,
@@ -18,7 +18,7 @@ from kontronik_can_gw.desk.conformance import (  # these modules add their items
     sdo_items,
     storage_items,
 )
-from kontronik_can_gw.desk.conformance.items import ITEMS, Item, Skipped, Wrong
+from kontronik_can_gw.desk.conformance.items import Skipped, Wrong
 from kontronik_can_gw.desk.conformance.nmt_items import RESET_NODE
 from kontronik_can_gw.desk.conformance.slave import (
     AbortedTransfer,
@@ -28,22 +28,44 @@ from kontronik_can_gw.desk.conformance.slave import (
 )
 from kontronik_can_gw.errors import UserError, did_you_mean
 
-GROUPS = (
-    ("NMT and heartbeat", nmt_items),
-    ("SDO", sdo_items),
-    ("Object dictionary", od_items),
-    ("PDO and SYNC", pdo_items),
-    ("Emergencies", emergency_items),
-    ("Stored parameters", storage_items),
-    ("EDS", eds_items),
-    ("LSS", lss_items),
-)
+_TEXTS = Path(__file__).with_name("items.toml")
+_GROUPS = {
+    "NMT and heartbeat": nmt_items,
+    "SDO": sdo_items,
+    "Object dictionary": od_items,
+    "PDO and SYNC": pdo_items,
+    "Emergencies": emergency_items,
+    "Stored parameters": storage_items,
+    "EDS": eds_items,
+    "LSS": lss_items,
+}
+"""The module with the procedures of each group of items."""
+
+
+class Item(NamedTuple):
+    """One item of the test."""
+
+    group: str
+    name: str
+    """Name in reports and in the file of deviations, for example "sdo-toggle-bit"."""
+    run: Callable[[Slave], str]
+    clause: str
+    stimulus: str
+    expected: str
+    needs: str = ""
+    """Item that shows that the slave has the service whose silence this item requires, or ""."""
+    objects: Sequence[str] = ()
+    """Objects that the EDS must have, for example "1016h:2"."""
 
 
 def all_items() -> list[Item]:
     """Return all items in the order of the test."""
-    modules = [module.__name__ for _, module in GROUPS]
-    return sorted(ITEMS, key=lambda item: modules.index(item.run.__module__))
+    found = []
+    for group, items in tomllib.loads(_TEXTS.read_text(encoding="ascii")).items():
+        for name, texts in items.items():
+            procedure = getattr(_GROUPS[group], name.replace("-", "_"))
+            found.append(Item(group, name, procedure, **texts))
+    return found
 
 
 class ItemVerdict(Enum):
@@ -133,8 +155,12 @@ def _run_item(slave: Slave, item: Item, reason: str) -> Result:
     begun_s = slave.clock()
     verdict = ItemVerdict.PASSED
     try:
-        if item.run.__module__ != eds_items.__name__:
+        if item.group != "EDS":
             slave.restart(RESET_NODE)
+        for place in item.objects:
+            index, _, sub = place.split()[-1].partition("h")
+            if not slave.has(int(index, 16), int(sub[1:] or 0)):
+                raise Skipped(f"the EDS does not have {place}")
         answer = item.run(slave)
     except Skipped as skipped:
         answer = str(skipped)
@@ -161,8 +187,8 @@ def counts(results: Sequence[Result]) -> str:
 
 def markdown_tables(results: Sequence[Result]) -> Iterator[str]:
     """Yield the lines of a table for each group of items."""
-    for title, module in GROUPS:
-        rows = [result for result in results if result.item.run.__module__ == module.__name__]
+    for title in _GROUPS:
+        rows = [result for result in results if result.item.group == title]
         if not rows:
             continue
         yield f"## {title}"

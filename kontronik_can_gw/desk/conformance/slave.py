@@ -99,20 +99,14 @@ class Slave:
             is_data = not (message.is_error_frame or message.is_remote_frame)
             if is_data and not message.is_extended_id:
                 frame = ReceivedFrame(message.arbitration_id, bytes(message.data), self.clock())
-                self._note_other_node(frame)
+                node_id = frame.can_id - _HEARTBEAT
+                if 0 < node_id < 0x80 and node_id != self.node_id:
+                    self.other_nodes.add(node_id)
                 return frame
 
     def waiting_frames(self) -> list[ReceivedFrame]:
         """Return the frames that have arrived."""
-        frames = []
-        while (frame := self.receive(0)) is not None:
-            frames.append(frame)
-        return frames
-
-    def _note_other_node(self, frame: ReceivedFrame) -> None:
-        node_id = frame.can_id - _HEARTBEAT
-        if 0 < node_id < 0x80 and node_id != self.node_id:
-            self.other_nodes.add(node_id)
+        return self.frames_during(0)
 
     def wait_for(
         self, condition: Callable[[ReceivedFrame], bool], limit_s: float | None = None
@@ -126,11 +120,8 @@ class Slave:
 
     def frames_during(self, seconds: float) -> list[ReceivedFrame]:
         """Return all frames that arrive within this time."""
-        frames = []
         until_s = self.clock() + seconds
-        while (frame := self.receive(until_s)) is not None:
-            frames.append(frame)
-        return frames
+        return list(iter(lambda: self.receive(until_s), None))
 
     def frames_until_answer(self) -> list[ReceivedFrame]:
         """Read the device type and return all frames that arrived before the answer.
@@ -212,7 +203,8 @@ class Slave:
         if answer[0] != ABORT:
             return answer
         if where is not None and answer[1:4] != where:
-            raise UnexpectedAnswer(answer, f"which does not name {name_of_object(where)}")
+            name = f"{int.from_bytes(where[:2], 'little'):04X}h:{where[2]:02X}"
+            raise UnexpectedAnswer(answer, f"which does not name {name}")
         raise AbortedTransfer(int.from_bytes(answer[4:8], "little"))
 
     def send_request(self, data: bytes) -> None:
@@ -268,8 +260,7 @@ class Slave:
         """Write a value in the size of the object's data type. Raises AbortedTransfer."""
         variable = self.variable(index, sub)
         assert variable is not None
-        size = len(variable) // 8
-        self.write(index, sub, (value & (1 << 8 * size) - 1).to_bytes(size, "little"))
+        self.write(index, sub, encoded(variable, value))
 
     # --- the object dictionary
 
@@ -310,11 +301,12 @@ class UnexpectedAnswer(Exception):
         super().__init__(f"{shown}, {reason}" if reason else shown)
 
 
+def encoded(variable: "ODVariable", value: int) -> bytes:
+    """Return a number in the size of the entry's data type, also outside its limits."""
+    size = len(variable) // 8
+    return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
+
+
 def multiplexer(index: int, sub: int) -> bytes:
     """Return index and sub-index as an SDO frame has them."""
     return index.to_bytes(2, "little") + bytes((sub,))
-
-
-def name_of_object(where: bytes) -> str:
-    """Return the name of a multiplexer, for example "1018h:01"."""
-    return f"{int.from_bytes(where[:2], 'little'):04X}h:{where[2]:02X}"

@@ -1,10 +1,9 @@
 """Storing and restoring parameters: CiA 301, objects 1010h and 1011h."""
 
-from kontronik_can_gw.desk.conformance.items import Skipped, item, require, require_abort
+from kontronik_can_gw.desk.conformance.items import Skipped, require, require_abort
 from kontronik_can_gw.desk.conformance.nmt_items import (
     HEARTBEAT_TIME,
     RESET_NODE,
-    require_heartbeat,
 )
 from kontronik_can_gw.desk.conformance.slave import Slave
 
@@ -13,48 +12,30 @@ _RESTORE = 0x1011
 _WRONG_SIGNATURE = (0x08000020, 0x08000021, 0x08000022)
 
 
-def _require_object(slave: Slave, index: int) -> None:
-    if not slave.has(index, 1):
-        raise Skipped(f"the EDS does not have {index:04X}h")
-
-
 def _require_store(slave: Slave) -> int:
     """Return 1010h:1. Skips the item if the slave states that it does not store."""
-    _require_object(slave, _STORE)
     value = slave.number(_STORE, 1)
     if value == 0:
         raise Skipped("1010h:1 is 0: the slave stores nothing, for example on a read-only disk")
     return value
 
 
-@item("CiA 301, 1010h", "upload of 1010h:1", "bit 0 or bit 1: how the slave stores")
 def store_capability(slave: Slave) -> str:
     value = _require_store(slave)
     require(value & 3 != 0 and value < 4, f"{value:08X}h")
     return f"{value:08X}h"
 
 
-@item("CiA 301, 1010h", "download of a wrong signature to 1010h:1", "abort 0800002xh")
 def store_wrong_signature(slave: Slave) -> str:
-    _require_object(slave, _STORE)
     return require_abort(lambda: slave.write(_STORE, 1, b"SAVE"), *_WRONG_SIGNATURE)
 
 
-@item("CiA 301, 1011h", "download of a wrong signature to 1011h:1", "abort 0800002xh")
 def restore_wrong_signature(slave: Slave) -> str:
-    _require_object(slave, _RESTORE)
     return require_abort(lambda: slave.write(_RESTORE, 1, b"LOAD"), *_WRONG_SIGNATURE)
 
 
-@item(
-    "CiA 301, 1010h, 1011h",
-    "1017h = 777 ms, save, reset node; then load, reset node",
-    "777 ms after save, the default after load",
-)
 def store_and_restore(slave: Slave) -> str:
     _require_store(slave)
-    _require_object(slave, _RESTORE)
-    require_heartbeat(slave)
     variable = slave.variable(HEARTBEAT_TIME)
     slave.write_number(HEARTBEAT_TIME, 0, 777)
     slave.write(_STORE, 1, b"save")
