@@ -15,6 +15,7 @@ test-all, the slow checks and the checks with other programs:
             It repeats the tests marked "rights": CI runs `test` as an ordinary user and
             `test-all` as root.
   masters   tests marked "extended" on a vcan, with CANopen masters of other projects
+  gate      all states of the gate, and pairs of rows of its table in both cores and a replay
   prove     the proofs of docs/proof.md that end within five minutes
   cuts      200 states after a power loss, in User Mode Linux
 
@@ -84,6 +85,9 @@ ON_VCAN = (
 )
 ELSEWHERE = "--ignore=tests/vcan --ignore=tests/proofs"
 """Folders with steps of their own."""
+GATE = "tests/gateway/test_gate.py tests/runtime/test_gate_rows.py"
+"""Its extended tests need only processor time, so that their step fills the shorter lane."""
+WITHOUT_GATE = " ".join(f"--ignore={file}" for file in GATE.split())
 FUZZ_OPTIONS = f"-s {LIMIT_AS_STEP}"
 PROOF = (
     "python -m pytest -q -s --junitxml={{report}} "
@@ -102,7 +106,9 @@ STEPS = {
     "unit": f"{PYTEST} {SIDE_BY_SIDE} -m 'not extended' {ELSEWHERE} {{args}}",
     "vcan": f"{ON_VCAN} -m 'not extended' {{args}}",
     "faults": FAULTS.format("uml"),
-    "tools": f"{PYTEST} {LIMIT_OF_TOOLS} -m 'extended or rights' {ELSEWHERE} {{args}}",
+    "tools": f"{PYTEST} {LIMIT_OF_TOOLS} -m 'extended or rights' {ELSEWHERE} {WITHOUT_GATE} "
+    "{args}",
+    "gate": f"{PYTEST} {LIMIT_OF_TOOLS} -m extended {GATE} {{args}}",
     "masters": f"{ON_VCAN} -m extended {{args}}",
     "prove": f"{PYTEST} -n 2 --dist worksteal tests/proofs {{args}}",
     "cuts": PLUG.format(200),
@@ -124,7 +130,7 @@ STEPS = {
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
-    "test-all": (("masters", "faults"), ("tools", "prove", "cuts")),
+    "test-all": (("masters", "faults", "cuts", "gate"), ("tools", "prove")),
     "prove": (("prove",),),
     "release": (
         (
