@@ -15,7 +15,8 @@ from simulated_bus import FLYING, Timed, flight, with_errors
 
 from kontronik_can_gw.desk.live.content import Content
 from kontronik_can_gw.desk.live.flights import Flights
-from kontronik_can_gw.desk.monitor.model import Esc, Quantity
+from kontronik_can_gw.desk.monitor.model import Esc
+from kontronik_can_gw.desk.quantities import Quantity
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, EscOptions, Faults
 from kontronik_can_gw.esc.kontronik.states import OperatingError
 from kontronik_can_gw.times import SECOND as S

@@ -15,9 +15,10 @@ from simulated_bus import flight, layout_of, with_errors
 
 from kontronik_can_gw.desk.monitor.charts import sparkline
 from kontronik_can_gw.desk.monitor.lines import number, shorten
-from kontronik_can_gw.desk.monitor.model import QUANTITIES, Monitor, Quantity
+from kontronik_can_gw.desk.monitor.model import Monitor
 from kontronik_can_gw.desk.monitor.screen import screen
 from kontronik_can_gw.desk.monitor.watch import obey
+from kontronik_can_gw.desk.quantities import QUANTITIES, Quantity
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.sources import DemoBus, Source
 from kontronik_can_gw.esc.kontronik.simulator import SECOND_NS, EscOptions

@@ -14,6 +14,7 @@ import pytest
 from report_flights import Row, column, flight_of, rows_of, simulated
 from simulated_bus import layout_of
 
+from kontronik_can_gw.desk.quantities import MINIMA
 from kontronik_can_gw.desk.receiver.unpacker import Value
 from kontronik_can_gw.desk.recordings.fields import ColumnType, TableColumn
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
@@ -21,7 +22,6 @@ from kontronik_can_gw.desk.report.esc import EscFlight
 from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.desk.report.page import render
-from kontronik_can_gw.desk.report.quantities import MINIMA
 from kontronik_can_gw.esc.kontronik.simulator import Dropout, ErrorWindow, EscOptions, Faults, Swap
 from kontronik_can_gw.esc.kontronik.states import (
     Device,

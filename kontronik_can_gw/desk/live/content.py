@@ -12,9 +12,9 @@ from typing import Any
 from kontronik_can_gw import __version__
 from kontronik_can_gw.desk.live.alarms import AlarmLog
 from kontronik_can_gw.desk.member import alarms_of
-from kontronik_can_gw.desk.monitor.model import QUANTITIES, Esc, Monitor, Quantity
+from kontronik_can_gw.desk.monitor.model import Esc, Monitor
 from kontronik_can_gw.desk.monitor.notices import link_of, notices, trouble_of
-from kontronik_can_gw.desk.report.quantities import PLOTS, Plot
+from kontronik_can_gw.desk.quantities import PLOTS, QUANTITIES, Plot, Quantity
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.desk.words import words
 from kontronik_can_gw.esc.value_names import normalize
@@ -37,11 +37,6 @@ _LARGE = (
     "bec_temperature",
 )
 """The values in large figures, in their order. The first speed in the DBC replaces all speeds."""
-_PLOTTED = {"battery_voltage": 1, "current": 1, "power": 1, "speed": 1, "temperature": 2}
-"""Keys of the report's plots that the page has, and the number of their lines.
-
-Further lines would hide the first one.
-"""
 _GOOD = {"gateway": "running", "CAN": "erroractive"}
 """The good states of gateway and controller."""
 _MARKS = {"": "", "!": "warning", "!!": "error"}
@@ -71,9 +66,8 @@ class Content:
         self._lines: list[tuple[Esc, Quantity]] = []
         """The lines of all plots, in the order of a step's values."""
         for plot in PLOTS:
-            if plot.key in _PLOTTED:
-                lines = [each for each in known if each.source in plot.lines.keys() - hidden]
-                self._add_plot(plot, lines[: _PLOTTED[plot.key]])
+            lines = [each for each in known if each.source in plot.lines.keys() - hidden]
+            self._add_plot(plot, lines[: plot.live_lines])
 
     def _add_plot(self, plot: Plot, lines: list[Quantity]) -> None:
         """Add a plot with a line for each quantity of each ESC."""

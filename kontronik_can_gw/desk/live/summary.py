@@ -25,14 +25,14 @@ def summary_of(capture: Path) -> dict[str, Any]:
         flight = flight_of(recording)
         if not flight.rows:
             raise RunError(*recording.damage, f"{capture.name}: has no values")
-        energies = [esc.energy_wh for esc in flight.escs if esc.energy_wh is not None]
+        energy_wh = flight.energy_wh
         severities = [event.severity for event in flight.events]
         return {
             "start": _start_ms(recording, flight.origin_ns),
             "duration": round((flight.end_ns - flight.start_ns) / SECOND, 1),
             "current": max(_extremes(flight, "battery_current"), default=None),
             "voltage": min(_extremes(flight, "battery_voltage"), default=None),
-            "energy": round(sum(energies), 2) if energies else None,
+            "energy": None if energy_wh is None else round(energy_wh, 2),
             "errors": severities.count("error"),
             "warnings": severities.count("warning"),
             "damage": len(recording.damage),

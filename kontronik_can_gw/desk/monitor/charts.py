@@ -6,7 +6,8 @@ from math import inf
 from rich.text import Text
 
 from kontronik_can_gw.desk.monitor.lines import Part, line
-from kontronik_can_gw.desk.monitor.model import Esc, Quantity
+from kontronik_can_gw.desk.monitor.model import Esc
+from kontronik_can_gw.desk.quantities import Quantity
 
 _LEVELS = "▁▂▃▄▅▆▇█"
 MARKS = {"": "bold", "!": "bold yellow", "!!": "bold red"}

@@ -4,9 +4,10 @@ All values are read from CAN frames. Pure: no I/O, no clock.
 """
 
 from collections import deque
-from typing import Any, NamedTuple
+from typing import Any
 
 from kontronik_can_gw.desk.member import Alarm, Member
+from kontronik_can_gw.desk.quantities import QUANTITIES
 from kontronik_can_gw.desk.receiver.unpacker import SignalReader
 from kontronik_can_gw.desk.receiver.view import View
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
@@ -21,57 +22,6 @@ HISTORY_S = 60
 """Length of a history, which has one value for each second."""
 SILENCE_NS = 5 * SECOND
 """After this time without a frame the screen shows possible causes."""
-
-
-class Quantity(NamedTuple):
-    """A measured value. Its limits are lower limits if ``alarm`` is below ``warning``."""
-
-    source: str
-    label: str
-    digits: int
-    head: str = ""
-    """Head of its column in the table of all ESCs. Empty: shown only on an ESC's own page."""
-    warning: float | None = None
-    alarm: float | None = None
-
-    @property
-    def unit(self) -> str:
-        return VALUES[self.source].unit
-
-    def mark(self, value: float) -> str:
-        """Return ``!!`` for a value beyond its alarm limit, ``!`` beyond its warning limit."""
-        if self.warning is None or self.alarm is None:
-            return ""
-        sign = 1 if self.alarm >= self.warning else -1
-        if sign * value >= sign * self.alarm:
-            return "!!"
-        if sign * value >= sign * self.warning:
-            return "!"
-        return ""
-
-
-# The most important quantities are first. The last ones are left out if the screen is too small.
-# The ESC does not report its limits. A lithium polymer cell is nearly empty below 3.5 V under load,
-# and damaged below 3.3 V.
-QUANTITIES = (
-    Quantity("motor_speed", "motor speed", 0, "1/min"),
-    Quantity("battery_voltage", "battery voltage", 2, "V"),
-    Quantity("battery_current", "battery current", 1, "A"),
-    Quantity("power_stage_temperature", "power stage", 0, "°C", 80, 100),
-    Quantity("mean_cell_voltage", "cell voltage", 2, "V cell", 3.5, 3.3),
-    Quantity("consumed_charge", "charge", 0, "mAh"),
-    Quantity("battery_power", "power", 0, "W"),
-    Quantity("throttle", "throttle", 0, "thr %"),
-    Quantity("bec_temperature", "BEC", 0, "BEC °C", 80, 100),
-    Quantity("output_opening", "opening", 0, "open %"),
-    Quantity("motor_current", "motor current", 1, "A motor"),
-    Quantity("peak_current", "peak current", 1, "A peak"),
-    Quantity("energy_used", "energy", 1, "Wh"),
-    Quantity("output_speed", "output speed", 0),
-    Quantity("electrical_speed", "electrical speed", 0),
-    Quantity("bec_voltage", "BEC voltage", 2),
-    Quantity("bec_current", "BEC current", 2),
-)
 
 
 _QUIET = "Quiet"

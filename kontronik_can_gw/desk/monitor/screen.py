@@ -20,14 +20,9 @@ from kontronik_can_gw.desk.monitor.lines import (
     table,
     wrapped,
 )
-from kontronik_can_gw.desk.monitor.model import (
-    HISTORY_S,
-    QUANTITIES,
-    Esc,
-    Monitor,
-    Quantity,
-)
+from kontronik_can_gw.desk.monitor.model import HISTORY_S, Esc, Monitor
 from kontronik_can_gw.desk.monitor.notices import NoticeKind, link_of, notices, trouble_of
+from kontronik_can_gw.desk.quantities import QUANTITIES, Quantity
 from kontronik_can_gw.desk.sources import Source
 from kontronik_can_gw.desk.words import words
 from kontronik_can_gw.esc.decoder import Severity

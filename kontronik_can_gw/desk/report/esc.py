@@ -11,9 +11,7 @@ from math import isfinite
 from operator import ne
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.desk.recordings.fields import ColumnType, TableColumn
-from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
-from kontronik_can_gw.desk.report.quantities import (
+from kontronik_can_gw.desk.quantities import (
     COMPUTED_FROM,
     COUNTERS,
     DRAWN,
@@ -22,6 +20,8 @@ from kontronik_can_gw.desk.report.quantities import (
     PHASES,
     SPEEDS,
 )
+from kontronik_can_gw.desk.recordings.fields import ColumnType, TableColumn
+from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
 from kontronik_can_gw.esc.decoder import EscProtocol
 from kontronik_can_gw.esc.protocols import protocol_named
 from kontronik_can_gw.esc.telemetry import EscSettings

@@ -10,11 +10,11 @@ from itertools import compress, islice, pairwise
 from operator import ne
 from typing import NamedTuple
 
+from kontronik_can_gw.desk.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
 from kontronik_can_gw.desk.recordings.fields import TableColumn, column_of
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, RowBlock
 from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight, Number
 from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
-from kontronik_can_gw.desk.report.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
@@ -123,6 +123,12 @@ class Flight:
         """The points to draw, by ESC and source. Complete after ``finish``."""
         self.events: list[FlightEvent] = []
         """All events, sorted by their begin. Complete after ``finish``."""
+
+    @property
+    def energy_wh(self) -> float | None:
+        """The energy of all ESCs. None if it is not known of any."""
+        known = [esc.energy_wh for esc in self.escs if esc.energy_wh is not None]
+        return sum(known) if known else None
 
     @property
     def has_anything(self) -> bool:

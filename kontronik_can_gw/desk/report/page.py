@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.desk import look
+from kontronik_can_gw.desk.quantities import PHASES, PLOTS, Plot
 from kontronik_can_gw.desk.report.esc import Number
 from kontronik_can_gw.desk.report.flight import Flight
-from kontronik_can_gw.desk.report.quantities import PHASES, PLOTS, Plot
 from kontronik_can_gw.desk.report.summary import tables, tiles
 from kontronik_can_gw.desk.words import clock, duration, number, wall_clock
 from kontronik_can_gw.esc.values import VALUES

@@ -6,60 +6,52 @@ Tiles show the most important numbers. Tables have a column for each ESC.
 from collections.abc import Mapping
 from html import escape
 
+from kontronik_can_gw.desk.quantities import COUNTERS, MAXIMA, MINIMA, TILES
 from kontronik_can_gw.desk.report.esc import EscFlight, Extreme
 from kontronik_can_gw.desk.report.flight import Flight
-from kontronik_can_gw.desk.report.quantities import COUNTERS, MAXIMA, MINIMA
 from kontronik_can_gw.desk.words import clock, duration, number
 from kontronik_can_gw.esc.values import VALUES
 from kontronik_can_gw.times import SECOND
-
-_EXTREMES = (
-    ("Peak power", "battery_power", 0),
-    ("Peak battery current", "battery_current", 1),
-    ("Lowest battery voltage", "battery_voltage", 2),
-    ("Hottest power stage", "power_stage_temperature", 0),
-)
-"""Label, source and decimals of the tiles with extremes."""
 
 
 def tiles(flight: Flight) -> str:
     """Return the most important numbers. Of several ESCs, the extreme and its ESC are shown."""
     escs = flight.escs
-    several = len(escs) > 1
-    found = [("Duration", duration(flight.end_ns - flight.start_ns), "")]
+    of_all, longest_of_all = (", all ESCs", "the longest of all") if len(escs) > 1 else ("", "")
+    html = _tile("Duration", duration(flight.end_ns - flight.start_ns))
     if any(esc.has_speed for esc in escs):
-        longest = duration(max(esc.turning_ns for esc in escs))
-        found.append(("Motor turning", longest, "the longest of all" if several else ""))
-    energies = [esc.energy_wh for esc in escs if esc.energy_wh is not None]
-    if energies:
-        charges = [esc.counted.get("consumed_charge") or 0 for esc in escs]
-        charge = _plain(sum(charges), 0, "mAh") if any(charges) else ""
-        label = "Energy, all ESCs" if several else "Energy"
-        found.append((label, _plain(sum(energies), 1, "Wh"), charge))
-    for label, source, digits in _EXTREMES:
-        of_escs = []
-        for esc in escs:
-            if source in esc.extremes:
-                name = escape(esc.name) if several else ""
-                of_escs.append((esc.extremes[source], name))
-        if of_escs:
-            best = min if source in MINIMA else max
-            extreme, name = best(of_escs)
-            value = _plain(extreme.value, digits, VALUES[source].unit)
-            aside = f"{_at(extreme, flight)} {name}"
-            found.append((label, value, aside))
-    html = "".join(_tile(*each) for each in found)
+        longest_ns = max(esc.turning_ns for esc in escs)
+        html += _tile("Motor turning", duration(longest_ns), longest_of_all)
+    if flight.energy_wh is not None:
+        charge = sum(esc.counted.get("consumed_charge") or 0 for esc in escs)
+        aside = _plain(charge, 0, "mAh") if charge else ""
+        html += _tile(f"Energy{of_all}", _plain(flight.energy_wh, 1, "Wh"), aside)
+    for source, label in TILES.items():
+        html += _extreme_tile(source, label, flight)
     if any(esc.has_errors for esc in escs):
         severities = [event.severity for event in flight.events if event.kind == "error"]
         errors = severities.count("error")
         warnings = severities.count("warning")
         aside = "1 warning" if warnings == 1 else f"{warnings} warnings"
-        kind = "bad" if errors else "good"
-        html += _tile("Errors", str(errors), aside, kind)
+        html += _tile("Errors", str(errors), aside, "bad" if errors else "good")
     return html
 
 
-def _tile(label: str, value: str, aside: str, kind: str = "") -> str:
+def _extreme_tile(source: str, label: str, flight: Flight) -> str:
+    """Return the tile of the extreme of all ESCs. Empty if it is not known."""
+    known = [esc for esc in flight.escs if source in esc.extremes]
+    if not known:
+        return ""
+    best = min if source in MINIMA else max
+    extreme, name = best((esc.extremes[source], escape(esc.name)) for esc in known)
+    if len(flight.escs) == 1:
+        name = ""
+    _, digits = (MAXIMA | MINIMA)[source]
+    value = _plain(extreme.value, digits, VALUES[source].unit)
+    return _tile(label, value, f"{_at(extreme, flight)} {name}")
+
+
+def _tile(label: str, value: str, aside: str = "", kind: str = "") -> str:
     text = f"<span>{label}</span><b>{value}</b><small>{aside or '&nbsp;'}</small>"
     return f'<div class="{kind}">{text}</div>'
 
