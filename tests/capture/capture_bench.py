@@ -4,7 +4,7 @@ The bench has the frames that it sent, and the entries of the recording.
 """
 
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.recordings.recording import Input, Sample
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.frames import CanFrame
@@ -258,3 +259,9 @@ def capture(
     """Write a ``capture_file``. Return its path."""
     path.write_bytes(capture_file(setup, entries, **more))  # type: ignore[arg-type]
     return path
+
+
+def samples(recording: Input, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
+    """Yield the rows of a recording one by one."""
+    for rows in recording.blocks(chosen):
+        yield from map(Sample, rows.times, zip(*rows.columns, strict=True))

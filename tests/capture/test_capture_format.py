@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from capture_bench import START, Bench, made
+from capture_bench import START, Bench, made, samples
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -238,10 +238,10 @@ def read_all(path: Path) -> None:
     try:
         with open_input(path) as found:
             assert isinstance(found, CaptureInput)
-            found.marked = True
+            found.is_marked = True
             for _ in found.frames():
                 pass
-            for row in found.samples():
+            for row in samples(found):
                 found.wall_ns(row.time_ns)
             list(found.esc_bytes(1))
             assert found.channel

@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from capture_bench import START, Bench, capture, made
+from capture_bench import START, Bench, capture, made, samples
 from simulated_bus import write_log
 
 from kontronik_can_gw.capture.format import (
@@ -56,7 +56,7 @@ def test_loss_is_a_row_without_values_until_the_next_frame(tmp_path: Path) -> No
     bench = plain_run(15, Faults(dropout=Dropout(2 * SECOND, 6 * SECOND)))
     with open_input(capture(tmp_path / "a.kcap", bench.setup, bench.entries)) as found:
         at = columns(found)
-        rows = list(found.samples())
+        rows = list(samples(found))
         assert found.wall_ns(START + 5) == 1_700_000_000 * SECOND + 5
     gaps = [(a, b) for a, b in pairwise(rows) if b.time_ns - a.time_ns > SECOND]
     assert len(gaps) == 2
@@ -78,7 +78,7 @@ def test_rows_of_a_can_log_have_values_while_they_are_fresh(tmp_path: Path) -> N
     with open_input(log) as found:
         assert isinstance(found, CanLogInput)
         at = columns(found)
-        rows = list(found.samples())
+        rows = list(samples(found))
         seconds = [(row.time_ns - rows[0].time_ns) / SECOND for row in rows]
         voltages = [row.values[at["battery_voltage"]] for row in rows]
         assert sum(v is not None for v in voltages) > 250
@@ -110,7 +110,7 @@ def test_run_is_selected_by_its_folder_or_the_beginning_of_its_name(tmp_path: Pa
         part=1,
     )
     with open_input(tmp_path / "20260102") as found, pytest.raises(UserError, match="another run"):
-        list(found.samples())
+        list(samples(found))
 
 
 def test_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_part_without_a_header_is_reported_and_the_others_are_read(tmp_path: Pat
     (tmp_path / "20260101T000000Z-aaaaaa-00000.kcap").write_bytes(b"")
     capture(tmp_path / "20260101T000000Z-aaaaaa-00001.kcap", bench.setup, bench.entries, part=1)
     with open_input(tmp_path) as found:
-        assert len(list(found.samples())) > 50
+        assert len(list(samples(found))) > 50
         expected = "20260101T000000Z-aaaaaa-00000.kcap: left out, because it has no readable header"
         assert expected in found.damage
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import equality
-from capture_bench import START, Bench, made
+from capture_bench import START, Bench, made, samples
 
 from kontronik_can_gw.capture.format import Entry, EntryKind, block, data_payload, json_payload
 from kontronik_can_gw.desk.recordings import bytes_input
@@ -118,7 +118,7 @@ def write_bytes(chance: random.Random, path: Path) -> Path:
 
 def read(recording: Input, chosen: Sequence[int]) -> list[Any]:
     """Return rows, frames and damage of a recording."""
-    rows = [(row.time_ns, row.values) for row in recording.samples(chosen)]
+    rows = [(row.time_ns, row.values) for row in samples(recording, chosen)]
     found = [rows, list(recording.damage)]
     frames = list(recording.frames())
     return [*found, frames, list(recording.damage)]

@@ -10,7 +10,7 @@ from capture_bench import Bench, capture_file, made
 from command_line import refused, run
 from log_files import READERS, SUFFIX
 
-from kontronik_can_gw.desk.recordings.can_logs.channels import Channels
+from kontronik_can_gw.desk.recordings.can_logs.writer import Channels
 
 pytestmark = pytest.mark.promise("logs")
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from capture_bench import samples
 from esc.reference import Found, frames_of
 from esc.streams import random_stream
 from recordings import convert, dump_bytes
@@ -86,7 +87,7 @@ def test_rows_are_exactly_the_frames_found_by_brute_force(
             speed, volts, amperes, *_ = struct.unpack_from(LIVE_STRUCT, frame.raw, 4)
             expected.append((time_ns, (speed, volts / 100, amperes / 10)))
     names = [field.name for field in dump.fields]
-    rows = dump.samples([names.index(name) for name in NAMES])
+    rows = samples(dump, [names.index(name) for name in NAMES])
     assert [(row.time_ns, row.values) for row in rows] == expected
     dropped = len(stream) - sum(len(frame.raw) for frame in found)
     told = [line.split()[0] for line in dump.damage if "outside of frames" in line]

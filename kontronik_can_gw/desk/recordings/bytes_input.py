@@ -16,8 +16,8 @@ from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core.python_core import PythonCore
-from kontronik_can_gw.desk.recordings.formats import BYTES, UART_MAGIC, format_of
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.desk.recordings.log_input import BYTES, UART_MAGIC, format_of
 from kontronik_can_gw.desk.recordings.played import PlayedInput
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader, name_of
 from kontronik_can_gw.errors import UserError
@@ -59,7 +59,13 @@ class BytesInput(PlayedInput):
         self._path = path
         timeout_ns = max(layout.escs[0].timeout_ns, 3 * PERIOD_NS)
         esc = replace(layout.escs[0], timeout_ns=timeout_ns)
-        setup = CaptureSetup((esc,), (str(path),), None, DbcConfig(), False)
+        setup = CaptureSetup(
+            (esc,),
+            (str(path),),
+            None,
+            DbcConfig(),
+            False,
+        )
         super().__init__(str(path), layout, setup)
         self.stream = stream
         self._head = b""
@@ -118,7 +124,7 @@ class BytesInput(PlayedInput):
         # the gateway is started before it receives the first byte
         gateway.port(0, True, 0)
         gateway.start(0)
-        if self.marked:
+        if self.is_marked:
             gateway.status.state = GatewayState.REPLAY
         if player is not None:
             yield from self._play_in_c(player)

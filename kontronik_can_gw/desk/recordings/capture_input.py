@@ -26,14 +26,14 @@ from kontronik_can_gw.capture.format import (
 from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.header_parts import HeaderError
-from kontronik_can_gw.desk.recordings.capture_clock import clock_facts, clock_steps
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, timed
-from kontronik_can_gw.desk.recordings.trusted_times import TrustedTimes
+from kontronik_can_gw.desk.recordings.trusted_times import TRUSTS, TrustedTimes
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import counted, printable
 from kontronik_can_gw.runtime.files.disk import is_locked
+from kontronik_can_gw.runtime.system.clock import ClockFacts
 from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ _NO_HEADER = (
     "has no readable header, so its content cannot be interpreted. "
     "Convert another part of this run, or the whole folder."
 )
+_STEP_NS = 100_000_000
+"""A smaller change of the wall clock is a correction and not reported."""
 _MAX_EVENTS = 10
 """Number of events that are listed."""
 _MAX_DAMAGE = 50
@@ -115,7 +117,13 @@ class CaptureInput(PlayedInput):
 
     @property
     def clock_steps(self) -> Sequence[ClockStep]:
-        return clock_steps(self._begun[1], self._offsets)
+        steps = []
+        offset = self._begun[1]
+        for time_ns, after in self._offsets:
+            if abs(after - offset) > _STEP_NS:
+                steps.append(ClockStep(time_ns, after - offset))
+            offset = after
+        return steps
 
     @property
     def notes(self) -> list[str]:
@@ -150,7 +158,7 @@ class CaptureInput(PlayedInput):
     def _play(
         self, gateway: "Gateway", player: "Player | None" = None
     ) -> "Iterator[list[TimedFrame] | Frames]":
-        replay = Replay(gateway, self.header.get("state"), self.marked, self.setup.version)
+        replay = Replay(gateway, self.header.get("state"), self.is_marked, self.setup.version)
         for frames in self._steps(replay, player):
             if player is not None:
                 sent = player.take_frames()
@@ -234,7 +242,7 @@ class CaptureInput(PlayedInput):
         if is_clock:
             # entries of the same time were written before the clock was set
             self._offsets.append((time_ns + 1, wall_ns - time_ns))
-            self.trust.add_flags(time_ns + 1, entry.flags)
+            self.trust.add(time_ns + 1, TRUSTS.get(entry.flags))
         if time_ns < self._last_ns:
             return entry._replace(time_ns=self._last_ns)
         self._last_ns = time_ns
@@ -378,6 +386,22 @@ class CaptureInput(PlayedInput):
         missing = number - int(first) - part
         if missing > 0:
             self.damage.append(f"{path.name}: {missing} earlier parts of the run are not given")
+
+
+def clock_facts(header: Mapping[str, Any]) -> ClockFacts:
+    """Return the state of the wall clock in a header.
+
+    Values that are missing or make no sense are unknown.
+    """
+    clock = header.get("clock")
+    if not isinstance(clock, dict):
+        return ClockFacts()
+    synchronized = clock.get("synchronized")
+    hardware = clock.get("hardware")
+    return ClockFacts(
+        synchronized=synchronized if isinstance(synchronized, bool) else None,
+        hardware=hardware if isinstance(hardware, str) else None,
+    )
 
 
 def _of_bytes(path: Path, damage: Damage) -> str:

@@ -54,7 +54,7 @@ class OutputFile:
        written directly.
     """
 
-    keeps_part = False
+    is_part_kept = False
     """True if ``NAME.part`` is kept when writing fails, because the input cannot be read again."""
 
     def __init__(self, target: Path | None, *, force: bool = False) -> None:
@@ -70,7 +70,7 @@ class OutputFile:
     @property
     def kept_part(self) -> Path | None:
         """The file with the data so far, if it was kept after a failure."""
-        if self.keeps_part and self._part is not None and self._part.exists():
+        if self.is_part_kept and self._part is not None and self._part.exists():
             return self._part
         return None
 
@@ -123,7 +123,7 @@ class OutputFile:
                 self._finish()
         finally:
             # The lock ends when the file is closed, so the name is removed before.
-            if self._part is not None and not (has_failed and self.keeps_part):
+            if self._part is not None and not (has_failed and self.is_part_kept):
                 self._part.unlink(missing_ok=True)
             if self._file is not None:
                 with suppress(OSError):  # the disk may be full. All kept data are on the disk.
@@ -138,7 +138,7 @@ class OutputFile:
             return
         os.fsync(self._file.fileno())
         if not self._force and os.path.lexists(self._target):
-            self.keeps_part = True
+            self.is_part_kept = True
             raise FileExistsError(errno.EEXIST, "another program has created it meanwhile")
         self._part.replace(self._target)
         self._part = None
@@ -175,7 +175,13 @@ def to_table(recording: "Input", out: OutputFile, form: str, choice: "Choice") -
     fields = [recording.fields[index] for index in choice.columns]
     has_utc = recording.wall_ns(origin_ns) is not None
     has_trust = has_utc and recording.trust.is_known
-    table = Table(fields, has_utc, has_trust, origin_ns, recording.provenance)
+    table = Table(
+        fields,
+        has_utc,
+        has_trust,
+        origin_ns,
+        recording.provenance,
+    )
     file = out.open()
     _flush_before_waits(recording, file)
     writer = _table_writer(file, form, table)
@@ -217,7 +223,14 @@ def to_log(
     wall_ns = recording.wall_ns(origin_ns)
     file = out.open()
     _flush_before_waits(recording, file)
-    writer = CanLogWriter(file, form, wall_ns, origin_ns, recording.channel, recording.provenance)
+    writer = CanLogWriter(
+        file,
+        form,
+        wall_ns,
+        origin_ns,
+        recording.channel,
+        recording.provenance,
+    )
     count, last_ns = _write_all(writer, batches, out)
     frames_written = counted(count - sum(writer.left_out.values()), "CAN frame")
     seconds = (last_ns - origin_ns) / 1e9

@@ -202,7 +202,11 @@ class Choice:
             return cls([*range(len(fields))], **times)
         chosen: dict[int, None] = {}
         problems = []
-        known = [_possible_names(one) for one in fields]
+        known = [
+            {_plain(one.name), _plain(one.name.rpartition(".")[2]), _plain(one.signal)} - {""}
+            for one in fields
+        ]
+        """The names by which a user can choose each field."""
         for name in names:
             wanted = _plain(name)
             forms = {wanted, wanted.removesuffix("percent")} - {""}
@@ -218,12 +222,6 @@ class Choice:
         if problems:
             raise UserError(*problems)
         return cls([*chosen], **times)
-
-
-def _possible_names(field: TableColumn) -> set[str]:
-    """Return the names by which a user can choose a field."""
-    without_esc = field.name.rpartition(".")[2]
-    return {_plain(field.name), _plain(without_esc), _plain(field.signal)} - {""}
 
 
 def _plain(name: str) -> str:

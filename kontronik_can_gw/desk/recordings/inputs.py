@@ -18,9 +18,15 @@ from kontronik_can_gw.capture.format import MAGIC, SUFFIX
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.bytes_input import BytesInput
 from kontronik_can_gw.desk.recordings.capture_input import CaptureInput
-from kontronik_can_gw.desk.recordings.formats import BYTES, CAPTURE, format_of
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
-from kontronik_can_gw.desk.recordings.log_input import STREAMED, CanLogInput, log_format
+from kontronik_can_gw.desk.recordings.log_input import (
+    BYTES,
+    CAPTURE,
+    STREAMED,
+    CanLogInput,
+    format_of,
+    log_format,
+)
 from kontronik_can_gw.desk.recordings.recording import Input
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, open_stream
 from kontronik_can_gw.errors import RunError, UserError

@@ -85,7 +85,13 @@ def _compile_layout(
         escs = [replace(esc, name=name) for esc, name in zip(known, names, strict=True)]
     elif not known:
         escs = [EscSettings(name) for name in names or ["esc1"]]
-    layout = prepare(database, file, escs, DbcConfig(node=node), fd_allowed=True)
+    layout = prepare(
+        database,
+        file,
+        escs,
+        DbcConfig(node=node),
+        fd_allowed=True,
+    )
     return BusLayout(database, layout, escs)
 
 

@@ -6,6 +6,7 @@ from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
+from kontronik_can_gw.capture.format import MAGIC
 from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.can_logs import asc, text
 from kontronik_can_gw.desk.recordings.fields import TableColumn
@@ -19,7 +20,6 @@ from kontronik_can_gw.desk.recordings.recording import (
     Input,
     LogFrame,
     RowBlock,
-    Sample,
 )
 from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader
@@ -37,7 +37,7 @@ _HEAD_LINES = 2000
 _LOOK_FOR_CHANNELS = 10_000
 """Number of frames in which further channels are looked for, once there are too many."""
 _BEGINNINGS = {b"LOGG": "blf", b"MDF     ": "mf4", b"UnFinMF ": "mf4"}
-_TEXTS: dict[str, tuple[Callable[[bytes], object], type[text.TextReader]]] = {
+_TEXTS: dict[str, tuple[Callable[[bytes], object], type[text.LogReader]]] = {
     "candump": (text.candump_line, text.CandumpReader),
     "asc": (asc.asc_line, asc.AscReader),
     "trc": (text.trc_line, text.TrcReader),
@@ -70,12 +70,55 @@ def candump_advice(head: bytes) -> str | None:
     return None
 
 
-def _reader_of(format_: str) -> type[text.LogReader]:
-    if format_ in _TEXTS:
-        return _TEXTS[format_][1]
-    from kontronik_can_gw.desk.recordings.can_logs import library
+CAPTURE = "capture"
+BYTES = "bytes"
+"""The formats that ``log_format`` does not find."""
+UART_MAGIC = b"KOD"
+"""The first bytes of every telemetry frame."""
+_COMPRESSED = {
+    b"\x1f\x8b": ("gzip", "zcat"),
+    b"BZh": ("bzip2", "bzcat"),
+    b"\xfd7zXZ": ("xz", "xzcat"),
+    b"(\xb5/\xfd": ("zstd", "zstdcat"),
+    b"PK\x03\x04": ("zip", "unzip -p"),
+}
+"""Name of a compression and the command that undoes it, by the first bytes of a file."""
 
-    return library.BlfReader if format_ == "blf" else library.Mf4Reader
+
+def format_of(
+    head: bytes,
+    name: str,
+    *,
+    is_capture: bool = False,
+    diagnosis: str | None = None,
+) -> str:
+    """Return the format of a recording with this head. Raises UserError if it is no recording.
+
+    ``diagnosis``: the reason why the bytes are not an ESC's, for the error.
+    """
+    if not head.strip():
+        raise UserError(f"{name}: is empty")
+    for magic, (kind, command) in _COMPRESSED.items():
+        if head.startswith(magic):
+            raise UserError(
+                f"{name}: is compressed with {kind}. Give its content through a pipe: "
+                f"{command} {name} | kontronik-can-gw COMMAND -"
+            )
+    if is_capture or MAGIC in head:
+        return CAPTURE
+    log = log_format(head)
+    if log is not None:
+        return log
+    if UART_MAGIC in head:
+        return BYTES
+    advice = candump_advice(head)
+    if advice is not None:
+        raise UserError(f"{name}: {advice}")
+    reason = "" if diagnosis is None else f" ({diagnosis})"
+    raise UserError(
+        f"{name}: is neither a capture nor a CAN log (candump, ASC, BLF, TRC, MF4), "
+        f"and has no ESC telemetry in its first {HEAD // 1024} kB{reason}"
+    )
 
 
 class CanLogInput(Input):
@@ -112,7 +155,13 @@ class CanLogInput(Input):
                 self._file = StreamReader(self.stream)
         except OSError as error:
             raise UserError(f"{self._path}: cannot be opened: {error.strerror}.") from None
-        self._reader = _reader_of(self._format)(self._file)
+        if self._format in _TEXTS:
+            self._reader: text.LogReader = _TEXTS[self._format][1](self._file)
+        else:
+            from kontronik_can_gw.desk.recordings.can_logs import library
+
+            kinds = {"blf": library.BlfReader, "mf4": library.Mf4Reader}
+            self._reader = kinds[self._format](self._file)
         self._clock = LogClock(self._reader, is_live=self.stream is not None)
 
     def _rewind(self) -> None:
@@ -221,9 +270,6 @@ class CanLogInput(Input):
         count = ROWS if self.stream is None else 1
         for times, columns in rows.blocks(self._data_frames(), count):
             yield RowBlock(times, columns, self.wall_offset_ns(times[0]))
-
-    def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
-        return self.samples(chosen)
 
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
         raise UserError(f"{self.name}: is a log of CAN frames, which has no bytes of ESC {esc + 1}")

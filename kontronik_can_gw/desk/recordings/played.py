@@ -8,7 +8,8 @@ from abc import abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import groupby, islice, pairwise
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
@@ -19,7 +20,14 @@ from kontronik_can_gw.core.output_setup import OutputMaker, ReadyOutput
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.recordings.fields import TableColumn
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
-from kontronik_can_gw.desk.recordings.recording import Input, PlayedBlock, RowBlock, Sample, timed
+from kontronik_can_gw.desk.recordings.recording import (
+    ROWS,
+    Input,
+    PlayedBlock,
+    RowBlock,
+    Sample,
+    timed,
+)
 from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native import load
@@ -55,7 +63,7 @@ class PlayedInput(Input):
 
     created_ns = 0
     """Time at which the gateway was made. Its cycles count from this time."""
-    marked = False
+    is_marked = False
     """True if the gateway's state in the frames is REPLAY."""
 
     def __init__(self, name: str, bus: BusLayout, setup: CaptureSetup) -> None:
@@ -95,21 +103,34 @@ class PlayedInput(Input):
                 return self._play(*played)
         return self._play(make())
 
-    def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
-        fields = [self.fields[index] for index in chosen]
-        rows = _RowOutput(fields)
-        for _ in self._play(self._silent_gateway((rows,))):
-            yield from rows.maker.take_rows()
-        yield from rows.maker.finish()
-
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock]:
         fields = self.fields
         if chosen is not None:
             fields = [self.fields[index] for index in chosen]
         found = self._player_of(self._silent_gateway, fields)
         if found is None:
-            return super().blocks(chosen)
+            return self._blocks_in_python(fields)
         return self._played(*found)
+
+    def _blocks_in_python(self, fields: Sequence[TableColumn]) -> Iterator[RowBlock]:
+        """Yield the rows that the core in Python makes."""
+        # the offset is taken with each row, so that a later clock step does not move earlier rows
+        rows = (
+            ((self.wall_offset_ns(row.time_ns), self.trust.at(row.time_ns)), *row)
+            for row in self._samples_in_python(fields)
+        )
+        size = ROWS if self.stream is None else 1
+        while some := list(islice(rows, size)):
+            for (wall_ns, is_trusted), group in groupby(some, itemgetter(0)):
+                _, times, values = zip(*group, strict=True)
+                columns = [*zip(*values, strict=True)]
+                yield RowBlock(times, columns, wall_ns, is_trusted)
+
+    def _samples_in_python(self, fields: Sequence[TableColumn]) -> Iterator[Sample]:
+        rows = _RowOutput(fields)
+        for _ in self._play(self._silent_gateway((rows,))):
+            yield from rows.maker.take_rows()
+        yield from rows.maker.finish()
 
     def _played(self, gateway: Gateway, player: "Player") -> Iterator[RowBlock]:
         done = 0

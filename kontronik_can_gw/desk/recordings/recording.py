@@ -5,8 +5,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
-from itertools import chain, groupby, islice, takewhile
-from operator import itemgetter
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
 
@@ -121,11 +120,6 @@ class RowBlock:
         found: Self = between(self, low_ns, high_ns)
         return found
 
-    def rows(self) -> Iterator[Sample]:
-        """Yield the rows one by one."""
-        values = zip(*self.columns, strict=True)
-        return map(Sample, self.times, values)
-
 
 class PlayedBlock(RowBlock):
     """Rows ``begin`` to ``end`` of the ``Rows`` that the C core made."""
@@ -155,7 +149,13 @@ class PlayedBlock(RowBlock):
 
     def part(self, begin: int, end: int) -> "PlayedBlock":
         first = self.begin
-        return PlayedBlock(self.made, first + begin, first + end, self.wall_ns, self.is_trusted)
+        return PlayedBlock(
+            self.made,
+            first + begin,
+            first + end,
+            self.wall_ns,
+            self.is_trusted,
+        )
 
 
 class Input(ABC):
@@ -264,31 +264,9 @@ class Input(ABC):
     def batches(self) -> "Iterator[Batch]":
         """Yield the frames for a log in batches, of all channels unless one was selected."""
 
+    @abstractmethod
     def blocks(self, chosen: Sequence[int] | None = None) -> Iterator[RowBlock]:
         """Yield rows of the values of the ``chosen`` fields, in that order. None: of all fields."""
-        if chosen is None:
-            chosen = range(len(self.fields))
-        samples = self.samples_in_python(chosen)
-        # the offset is taken with each row, so that a later clock step does not move earlier rows
-        rows = ((self._clock_at(row.time_ns), *row) for row in samples)
-        size = ROWS if self.stream is None else 1
-        while some := list(islice(rows, size)):
-            for (wall_ns, is_trusted), group in groupby(some, itemgetter(0)):
-                _, times, values = zip(*group, strict=True)
-                columns = [*zip(*values, strict=True)]
-                yield RowBlock(times, columns, wall_ns, is_trusted)
-
-    def _clock_at(self, time_ns: int) -> tuple[int | None, bool | None]:
-        return self.wall_offset_ns(time_ns), self.trust.at(time_ns)
-
-    def samples(self, chosen: Sequence[int] | None = None) -> Iterator[Sample]:
-        """Yield the rows one by one."""
-        for block in self.blocks(chosen):
-            yield from block.rows()
-
-    @abstractmethod
-    def samples_in_python(self, chosen: Sequence[int]) -> Iterator[Sample]:
-        """Yield the rows one by one, made in Python even if the C core is available."""
 
     @abstractmethod
     def esc_bytes(self, esc: int) -> Iterator[bytes]:
@@ -317,24 +295,23 @@ class Input(ABC):
 
 
 def _described(steps: Sequence[ClockStep], begin_ns: int) -> list[str]:
-    kept = [step for step in steps if step.is_kept]
-    hidden = [step for step in steps if not step.is_kept]
+    hidden = []
+    kept = []
+    for step in steps:
+        elapsed_ns = step.time_ns - begin_ns
+        if step.is_kept:
+            elapsed_ns -= step.by_ns  # the time after the jump contains the jump
+        about = f"by {duration(abs(step.by_ns))} after {duration(elapsed_ns)}"
+        if step.is_kept:
+            kept.append(about)
+        else:
+            hidden.append(f"{'back' if step.by_ns < 0 else 'ahead'} {about}")
     notes = []
     if hidden:
-        listed = []
-        for step in hidden:
-            direction = "back" if step.by_ns < 0 else "ahead"
-            elapsed_ns = step.time_ns - begin_ns
-            listed.append(f"{direction} {_by_and_after(step, elapsed_ns)}")
-        notes.append(f"the clock was set {_some_of(listed)}; times continue without the step")
+        notes.append(f"the clock was set {_some_of(hidden)}; times continue without the step")
     if kept:
-        listed = []
-        for step in kept:
-            before_ns = step.time_ns - step.by_ns  # the time after the jump contains the jump
-            elapsed_ns = before_ns - begin_ns
-            listed.append(_by_and_after(step, elapsed_ns))
         notes.append(
-            f"times jump ahead {_some_of(listed)}: a pause, or the clock was set; the jump is kept"
+            f"times jump ahead {_some_of(kept)}: a pause, or the clock was set; the jump is kept"
         )
     return notes
 
@@ -352,11 +329,6 @@ def _described_trust(untrusted: Sequence[tuple[int, int | None]], begin_ns: int)
     some = _some_of([text for text in listed if text])
     when = f" {some}" if some else ""
     return f"the clock was not synchronised{when}: dates and times of day are not reliable then"
-
-
-def _by_and_after(step: ClockStep, elapsed_ns: int) -> str:
-    """Describe the size of a step, and the time from the recording's beginning to the step."""
-    return f"by {duration(abs(step.by_ns))} after {duration(elapsed_ns)}"
 
 
 def _some_of(listed: list[str]) -> str:

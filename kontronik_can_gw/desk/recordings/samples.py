@@ -57,10 +57,10 @@ class RowMaker(Output):
         self._status = status
         self._values: list[Value] = [None] * len(fields)
         """The newest value of each field."""
-        self._row_ns: int | None = None
-        """Time of the row that is being filled. None if there is no such row."""
-        self._last_ns = 0
-        """Time of the last complete row."""
+        self._is_open = False
+        """True while a row is being filled."""
+        self._row_ns = 0
+        """Time of the newest row, which is open or complete."""
         self._in_row: set[int] = set()
         """ESCs whose live frames are in the row that is being filled."""
         self._gateway_ns = now - GATEWAY_NS
@@ -96,15 +96,10 @@ class RowMaker(Output):
         when = now
         if is_live and state.live is not None and state.live_ns is not None:
             when = min(now, state.live_ns)  # arrival of the frame's last byte
-        # the times of rows never decrease
-        row_ns = self._row_ns
-        if row_ns is None:
-            when = max(when, self._last_ns)
-        else:
-            when = max(when, row_ns)
-            has_frame = is_live and esc in self._in_row
-            if has_frame or when - row_ns > SAME_ROW_NS:
-                self._close_row()
+        when = max(when, self._row_ns)  # the times of rows never decrease
+        has_frame = is_live and esc in self._in_row
+        if has_frame or when - self._row_ns > SAME_ROW_NS:
+            self._close_row()
         values = self._values
         status = self._status
         for index, read in self._readers.get(esc, ()):
@@ -117,15 +112,14 @@ class RowMaker(Output):
                 values[index] = read(None, status, when)
         if is_live:
             self._in_row.add(esc)
-            if self._row_ns is None:
+            if not self._is_open:
+                self._is_open = True
                 self._row_ns = when
 
     def _close_row(self) -> None:
-        if self._row_ns is not None:
-            row = Sample(self._row_ns, tuple(self._values))
-            self._rows.append(row)
-            self._last_ns = self._row_ns
-            self._row_ns = None
+        if self._is_open:
+            self._rows.append(Sample(self._row_ns, tuple(self._values)))
+            self._is_open = False
             self._in_row.clear()
 
 

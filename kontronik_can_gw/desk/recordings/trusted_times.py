@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 from kontronik_can_gw.capture.format import CLOCK_FLAGS
 
-_TRUSTS = {flags: is_trusted for is_trusted, flags in CLOCK_FLAGS.items()}
+TRUSTS = {flags: is_trusted for is_trusted, flags in CLOCK_FLAGS.items()}
+"""If the wall clock is synchronised, by the flags of a CLOCK entry."""
 
 
 class TrustedTimes:
@@ -23,10 +24,6 @@ class TrustedTimes:
     def restart(self) -> None:
         """Forget all changes, because the capture is read again."""
         self._changes = []
-
-    def add_flags(self, time_ns: int, flags: int) -> None:
-        """Add the state of a CLOCK entry."""
-        self.add(time_ns, _TRUSTS.get(flags))
 
     def add(self, time_ns: int, is_trusted: bool | None) -> None:
         self._changes.append((time_ns, is_trusted))

@@ -42,7 +42,7 @@ class AscReader(TextReader):
     """The reader of Vector ASC: base hex or dec, times absolute or relative, CAN and CAN FD."""
 
     _base = 16
-    _relative = False
+    _is_relative = False
     _now = 0
     """Time of the last line, if times are relative."""
 
@@ -55,31 +55,27 @@ class AscReader(TextReader):
         written = None
         began = None
         for line in lines:
-            text = line.decode("utf-8", "replace").lower()
-            words = text.split()
+            found = _frame(line)
+            if found is not None:
+                break
+            words = line.decode("utf-8", "replace").lower().split()
             if words[:1] == ["base"]:
-                self._base = 16
-                if words[1:2] == ["dec"]:
-                    self._base = 10
-                self._relative = words[-1] == "relative"
+                self._base = 10 if words[1:2] == ["dec"] else 16
+                self._is_relative = words[-1] == "relative"
             elif words[:1] == ["date"]:
                 written = asc_time(words[2:])
             elif words[:2] == ["begin", "triggerblock"]:
                 began = asc_time(words[3:])
-            else:
-                found = _frame(line)
-                if found is not None:
-                    break
         else:
             found = None
         began = began or written
         self._now = 0
         if began is None:
             return None
-        if found is not None and not self._relative:
-            first_s = float(found["time"])
-            began = _time_zero(began, written or began, first_s)
-        start_ns = _unix_ns(began)
+        if found is not None and not self._is_relative:
+            began = _time_zero(began, written or began, float(found["time"]))
+        moment, fraction_ns = began
+        start_ns = int(moment.timestamp()) * SECOND + fraction_ns
         return start_ns if start_ns >= OLDEST_WALL_S * SECOND else None
 
     def _frame(self, line: bytes) -> LogFrame | None:
@@ -88,7 +84,7 @@ class AscReader(TextReader):
         if words[0].startswith(b"//") or words[0] in _HEADS:
             return None
         time_ns = nanoseconds(words[0])
-        if self._relative:
+        if self._is_relative:
             self._now += time_ns
             time_ns = self._now
         is_fd = words[1:2] == [b"canfd"]
@@ -134,7 +130,12 @@ class AscReader(TextReader):
         if code and not length:
             frame = remote_frame(number, code, extended)
         else:
-            frame = CanFrame(number, self._bytes(data, length), extended, fd=True)
+            frame = CanFrame(
+                number,
+                self._bytes(data, length),
+                extended,
+                fd=True,
+            )
         return _logged(time_ns, frame, direction == b"rx", channel)
 
     def _bytes(self, words: list[bytes], length: int) -> bytes:
@@ -191,11 +192,6 @@ def asc_time(words: list[str]) -> _Moment | None:
         return None
 
 
-def _unix_ns(started: _Moment) -> int:
-    moment, fraction_ns = started
-    return int(moment.timestamp()) * SECOND + fraction_ns
-
-
 def _time_zero(began: _Moment, written: _Moment, first_s: float) -> _Moment:
     """Return the time from which the times in the file count. The file does not contain it.
 
@@ -210,7 +206,12 @@ def _time_zero(began: _Moment, written: _Moment, first_s: float) -> _Moment:
         since_zero = begin - moment
         return abs(since_zero.total_seconds() - first_s)
 
-    closest = min(began, written, midnight, key=distance_s)
+    closest = min(
+        began,
+        written,
+        midnight,
+        key=distance_s,
+    )
     if distance_s(closest) > _CLOSE_S:
         return began
     return closest

@@ -93,7 +93,12 @@ def remote_frame(can_id: int, dlc: int, extended: bool) -> CanFrame:
     """Return a remote frame. Raises ValueError if it requests an impossible number of bytes."""
     if not 0 <= dlc <= 15:
         raise ValueError
-    return CanFrame(can_id, bytes(min(dlc, 8)), extended, remote=True)
+    return CanFrame(
+        can_id,
+        bytes(min(dlc, 8)),
+        extended,
+        remote=True,
+    )
 
 
 class LogReader:

@@ -5,6 +5,7 @@ except in MF4, which contains the time of writing.
 """
 
 import io
+import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -12,7 +13,6 @@ from datetime import UTC, datetime, timedelta
 from types import MappingProxyType
 from typing import IO, TYPE_CHECKING, Any, cast
 
-from kontronik_can_gw.desk.recordings.can_logs.channels import Channels
 from kontronik_can_gw.desk.recordings.recording import ERROR, LogFrame
 from kontronik_can_gw.light_imports import without_asammdf
 from kontronik_can_gw.times import END_OF_TIME, MS, SECOND
@@ -24,6 +24,74 @@ if TYPE_CHECKING:
 
 _DIRECTIONS = {True: " R", False: " T", None: ""}
 """Ends of the lines of candump."""
+
+
+_LARGEST = 255
+"""Largest number that is possible in every format."""
+_number_in = re.compile(r"(\d{1,3})$").search
+
+
+class Channels:
+    """Gives each channel a distinct number or name, in the order in which channels appear.
+
+    can0 becomes 1, and 1 becomes can0. A number that is taken, or too large for the format, is
+    replaced by the lowest free number. ``own`` is the name of the gateway's own bus, whose number
+    is 1.
+    """
+
+    def __init__(self, own: str) -> None:
+        self._own = own
+        self._numbers: dict[str, int] = {}
+        """The given numbers by channel."""
+        self._names: dict[str, str] = {}
+        """The given names by channel."""
+
+    def number_of(self, channel: str) -> int:
+        """Return the channel's number, for formats with numbers."""
+        if channel not in self._numbers:
+            taken = self._numbers.values()
+            number = _natural_number(channel)
+            if number in taken or not 1 <= number <= _LARGEST:
+                number = 1
+                while number in taken:
+                    number += 1
+            self._numbers[channel] = number
+        return self._numbers[channel]
+
+    def name_of(self, channel: str) -> str:
+        """Return the channel's name, for formats with names."""
+        if channel not in self._names:
+            name = channel or self._own
+            if channel.isdigit():
+                name = f"can{self.number_of(channel) - 1}"
+            taken = self._names.values()
+            if name in taken:
+                number = 0
+                while f"can{number}" in taken:
+                    number += 1
+                name = f"can{number}"
+            self._names[channel] = name
+        return self._names[channel]
+
+    @property
+    def changes(self) -> str:
+        """The changed channels, for example "can0 is 1, can1 is 2". Empty for can0 alone."""
+        given = self._names or self._numbers
+        changed = {old: new for old, new in given.items() if old and old != str(new)}
+        if list(changed) in (["can0"], ["1"]):
+            return ""
+        return ", ".join(f"{old} is {new}" for old, new in changed.items())
+
+
+def _natural_number(channel: str) -> int:
+    if not channel:
+        return 1
+    if channel.isdigit():
+        return int(channel)
+    found = _number_in(channel)
+    if found is None:
+        return 0
+    return int(found[1]) + 1
 
 
 class CanLogWriter:
@@ -105,7 +173,12 @@ class CanLogWriter:
         if start_ns is not None:
             moment = datetime.fromtimestamp(start_ns // SECOND)  # noqa: DTZ006
         stamp = moment.strftime(f"%a %b %d %H:%M:%S.{(start_ns or 0) // MS % 1000:03d} %Y")
-        text = io.TextIOWrapper(file, encoding="ascii", newline="\n", write_through=True)
+        text = io.TextIOWrapper(
+            file,
+            encoding="ascii",
+            newline="\n",
+            write_through=True,
+        )
         writer = ASCWriter(io.StringIO())
         writer.file = text
         writer.header_written = True
@@ -137,7 +210,12 @@ class CanLogWriter:
     def _trc(self, file: IO[bytes], start_ns: int) -> None:
         with without_asammdf():
             from can import TRCWriter
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="\r\n", write_through=True)
+        text = io.TextIOWrapper(
+            file,
+            encoding="utf-8",
+            newline="\r\n",
+            write_through=True,
+        )
         writer = TRCWriter(_Unclosed(text))
         writer.filepath = "kontronik-can-gw"
         writer.first_timestamp = 0.0
