@@ -7,7 +7,9 @@ gateway does not run, the answer is 503, so that Prometheus's own metric ``up`` 
 import re
 import socket
 import time
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
@@ -32,57 +34,7 @@ Sample = tuple[str, float | None, dict[str, object]]
 REQUEST_S = 5.0
 """Longest time that a client may be silent."""
 _LOOPBACK = re.compile(r"(localhost|127(\.[0-9]{1,3}){3}|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
-_UNITS: Mapping[str, tuple[str, float]] = {
-    "V": ("_volts", 1),
-    "A": ("_amperes", 1),
-    "W": ("_watts", 1),
-    "Wh": ("_joules", 3600),
-    "mAh": ("_coulombs", 3.6),
-    "°C": ("_celsius", 1),
-    "%": ("_ratio", 0.01),
-    "s": ("_seconds", 1),
-    "µs": ("_seconds", 1e-6),
-    "1/min": ("_revolutions_per_second", 1 / 60),
-    "": ("", 1),
-}
-"""For our units: suffix with the base unit, and factor to it."""
-_NAMES = {
-    "cell_count": "cells",  # promtool reserves the ending _count for summaries
-    "energy_used": "energy_used_joules_total",
-    "motor_run_time": "motor_run_time_seconds_total",
-    "bytes": "received_bytes",
-    "live": "live_frames",
-    "info": "info_frames",
-}
-"""Names of metrics that differ from the name in the document."""
-_GATEWAY = {
-    "uptime_seconds": "process.uptime_s",
-    "process_resident_memory_bytes": "process.rss_bytes",
-    "process_open_fds": "process.open_fds",
-    "process_threads": "process.threads",
-    "gateway_escs": "gateway.esc_count",
-    "gateway_escs_ok": "gateway.escs_ok",
-    "can_bitrate": "can.bitrate",
-    "can_open": "can.open",
-    "can_stalled": "can.stalled",
-    "store_waiting": "store.waiting",
-    "recording_bytes_total": "recording.bytes",
-    "recording_lost_total": "recording.lost",
-}
-_ESC = {
-    "esc_fresh": "fresh",
-    "esc_port_open": "port.open",
-    "esc_port_reopened_total": "port.reopened",
-    "esc_frame_rate_hertz": "frame_rate_hz",
-    "esc_losses_total": "losses",
-    "esc_data_age_seconds": "data_age_ms",
-}
-"""Metrics with a value of the document, and its place."""
-_WORDS = {
-    "operating_error": ("errors", "warnings", "statuses"),
-    "selftest_error": ("selftest_errors",),
-}
-"""Error words, and the lists of the document that hold their bits."""
+_TABLES = tomllib.loads(Path(__file__).with_name("metrics.toml").read_text(encoding="utf-8"))
 
 
 def families(document: Document, age_s: float) -> list[Metric]:
@@ -113,7 +65,7 @@ def _samples(document: Document, age_s: float) -> Iterator[Sample]:
     recording = document["recording"]
     yield "build_info", 1, {"version": document["version"]}
     yield "snapshot_age_seconds", round(age_s, 3), {}
-    for name, place in _GATEWAY.items():
+    for name, place in _TABLES["gateway"].items():
         yield name, _at(document, place), {}
     if store is not None:
         yield "store_failed", store["last_error"] is not None, {}
@@ -154,7 +106,7 @@ def _clock(clock: Document) -> Iterator[Sample]:
 def _esc(esc: Document, units: Mapping[str, str]) -> Iterator[Sample]:
     """Yield the samples of an ESC: its line, its values in base units, its error bits."""
     labels: dict[str, object] = {"esc": esc["name"]}
-    for name, place in _ESC.items():
+    for name, place in _TABLES["esc"].items():
         value = _at(esc, place)
         if value is not None and place.endswith("_ms"):
             value /= 1000
@@ -166,20 +118,20 @@ def _esc(esc: Document, units: Mapping[str, str]) -> Iterator[Sample]:
     for kind, count in esc["port"]["line_errors"].items():
         yield "esc_port_line_errors_total", count, labels | {"kind": kind}
     for key, count in esc["counters"].items():
-        yield f"esc_{_NAMES.get(key, key)}_total", count, labels
+        yield f"esc_{_TABLES['names'].get(key, key)}_total", count, labels
     for name, unit in units.items():
         value = esc["values"][name]
-        base, factor = _UNITS[unit]
+        base, factor = _TABLES["units"][unit]
         if value is not None:
             value *= factor
-        yield _NAMES.get(name, f"{name}{base}"), value, labels
+        yield _TABLES["names"].get(name, f"{name}{base}"), value, labels
     yield from _error_bits(esc, labels)
 
 
 def _error_bits(esc: Document, labels: dict[str, object]) -> Iterator[Sample]:
     """Yield a sample for each bit of the error words that are available: 1 if it is set."""
     bits = protocol_named(esc.get("protocol")).errors
-    for word, keys in _WORDS.items():
+    for word, keys in _TABLES["error_words"].items():
         lists = [esc[key] for key in keys]
         if None in lists:  # the word is not available
             continue
@@ -264,7 +216,13 @@ def server_of(
             """Log nothing: clients that disconnect early or never finish are not our fault."""
 
     try:
-        return make_server(host, port, answer, Server, _Handler)
+        return make_server(
+            host,
+            port,
+            answer,
+            Server,
+            _Handler,
+        )
     except OSError as error:
         where = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         reason = f"cannot be used: {error.strerror}. Choose another address or port."

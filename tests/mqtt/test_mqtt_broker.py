@@ -161,8 +161,8 @@ def test_only_the_newest_message_of_a_topic_waits_and_retained_go_first(broker: 
     for number in range(1000):
         client.offer(Publication("k/test/state", b"%d" % number))
         client.offer(Publication("k/test/other", b"%d" % number))
-    client.offer(Publication("k/test/known", b"1", lasting=True, retain=True))
-    client.offer(Publication("k/test/known", b"2", lasting=True, retain=True))
+    client.offer(Publication("k/test/known", b"1", is_lasting=True, retain=True))
+    client.offer(Publication("k/test/known", b"2", is_lasting=True, retain=True))
     assert waiting(client) == 3
     with Subscriber(broker.port, "k/test/#") as heard:
         client.start()
@@ -256,7 +256,7 @@ def test_tls_accepts_an_own_authority_and_refuses_wrong_certificates(tmp_path: P
         with connecting(right) as client:
             turning(client, lambda: client.problem == "")
             # larger than a TLS record, and than the kernel accepts at once
-            client.offer(Publication("k/tls/big", b"x" * 300_000, lasting=True))
+            client.offer(Publication("k/tls/big", b"x" * 300_000, is_lasting=True))
             turning(client, lambda: not waiting(client))
         wrong: list[tuple[dict[str, Any], str]] = [
             ({"ca_file": None}, "CERTIFICATE_VERIFY_FAILED"),

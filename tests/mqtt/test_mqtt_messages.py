@@ -20,8 +20,7 @@ from simulated_bus import START_S, STEP_NS, Timed, flight, layout_of, with_error
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.desk.dbc.writer import copies_text
 from kontronik_can_gw.desk.mqtt.messages import Publication, Publisher, iso
-from kontronik_can_gw.desk.mqtt.published import MIN_PAUSE_NS
-from kontronik_can_gw.desk.mqtt.topics import Topics
+from kontronik_can_gw.desk.mqtt.published import MIN_PAUSE_NS, Topics
 from kontronik_can_gw.desk.receiver.unpacker import SignalReader
 from kontronik_can_gw.esc.kontronik.simulator import (
     SECOND_NS,

@@ -34,7 +34,8 @@ def objects(setup: CanopenSetup, escs: Sequence[EscSettings]) -> list[MarkdownTa
     eds = setup.eds
     named = []
     for node, esc in zip(setup.nodes(escs).nodes, escs, strict=True):
-        named.append((_title(node, esc), node))
+        state = "waits for LSS" if node.node_id == UNCONFIGURED else node.node_id
+        named.append((f"{esc.name}, {state}", node))
     refused = ""
     if any(settings.read_only for settings in setup.settings):
         refused = "Nothing can be written over the bus: canopen.read_only is true."
@@ -63,11 +64,6 @@ def _cob_ids(nodes: Sequence[tuple[str, Node]]) -> Iterator[Row]:
         use_of = {use.cob_id: use.what for use in node.uses()}
         for cob_id, use in sorted(use_of.items()):
             yield {"node": name, "cob_id": cob_id, "use": use}
-
-
-def _title(node: Node, esc: EscSettings) -> str:
-    state = "waits for LSS" if node.node_id == UNCONFIGURED else str(node.node_id)
-    return f"{esc.name}, {state}"
 
 
 def _pdos(nodes: Sequence[tuple[str, Node]]) -> Iterator[Row]:
@@ -148,21 +144,18 @@ def emergencies(eds: Eds | None, escs: Sequence[EscSettings]) -> list[MarkdownTa
         if not bits:
             continue
         codes = BitCodes(bits)
-        bit_of = {int(bit): bit for bit in bits}
+        about_bits = {int(bit): (bit.text, bit.meaning, bit.remedy) for bit in bits}
         for position in range(32):
             if not mask >> position & 1:
                 continue
-            bit = bit_of.get(position)
-            if bit is None:
-                about = (
-                    f"bit{position}",
-                    "a bit without a name",
-                    "Ask the manufacturer of the ESC.",
-                )
-            else:
-                about = (bit.text, bit.meaning, bit.remedy)
-            code = codes.code(position)
-            rows.append(_emergency(code, str(position), None, about))
+            about = (
+                f"bit{position}",
+                "a bit without a name",
+                "Ask the manufacturer of the ESC.",
+            )
+            if position in about_bits:
+                about = about_bits[position]
+            rows.append(_emergency(codes.code(position), str(position), None, about))
     for fault in GatewayError:
         code, detail = fault.value
         byte4 = None if fault is GatewayError.HEARTBEAT_LOST else detail

@@ -99,7 +99,12 @@ def _cell(key: str, value: object) -> str:
 def _wrapped(paragraph: str) -> str:
     """Return running text in lines, with every character of Markdown syntax escaped."""
     plain = " ".join(paragraph.split())
-    lines = wrap(plain, _WIDTH, break_long_words=False, break_on_hyphens=False)
+    lines = wrap(
+        plain,
+        _WIDTH,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
     return "\n".join(map(text, lines))
 
 

@@ -7,10 +7,11 @@ A physical value is raw * factor + offset.
 
 import math
 import re
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from fractions import Fraction
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.canopen.emergency_codes import GatewayError
@@ -55,16 +56,15 @@ def configuration() -> list[MarkdownTable]:
 
 
 def _keys(table: Any) -> list[Row]:
-    rows = []
-    for key in fields(table):
-        row = {
+    return [
+        {
             "key": key.name,
             "range": key.metadata["kind"].span,
             "default": _default(key),
             "meaning": key.metadata["doc"],
         }
-        rows.append(row)
-    return rows
+        for key in fields(table)
+    ]
 
 
 def _default(key: Field[Any]) -> object:
@@ -89,6 +89,9 @@ def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[MarkdownTable]:
     comments = [each.comment for each in bus.database.buses if each.comment]
     comment = comments[0] if comments else ""
     file = f"{PurePath(layout.file).name}, messages of {layout.node}."
+    esc_names: dict[int | None, str] = {}
+    if len(escs) > 1:
+        esc_names.update(enumerate(esc.name for esc in escs))
     messages: list[Row] = []
     signals: list[Row] = []
     for plan in layout.messages:
@@ -98,7 +101,7 @@ def dbc(bus: BusLayout, escs: Sequence[EscSettings]) -> list[MarkdownTable]:
         for signal in plan.signals:
             original = signal_of_file[signal.name]
             row: Row = {"message": plan.name}
-            row |= _signal(plan, signal, original, escs)
+            row |= _signal(plan, signal, original, esc_names)
             signals.append(row)
     return [
         MarkdownTable("Messages", [file, _line(comment)], messages),
@@ -133,30 +136,26 @@ def _signal(
     message: MessagePlan,
     plan: SignalPlan,
     signal: Any,
-    escs: Sequence[EscSettings],
+    esc_names: Mapping[int | None, str],
 ) -> Row:
     """Return the row of a signal.
 
     ``min`` and ``max`` are the DBC's, or else the limits of the values that can be sent. ``shows``
     is the name of the value, or the role of the bits.
     """
-    is_flag = _is_flag(plan)
+    kind = "signed" if plan.signed else "unsigned"
+    if plan.is_float:
+        kind = "float"
+    elif kind == "unsigned" and plan.length == plan.factor == 1 and plan.offset == 0:
+        kind = "flag"
     not_available: int | None = plan.not_available
     error: int | None = plan.error
-    if plan.role is not Role.SOURCE or (is_flag and plan.numbers is None):
+    if plan.role is not Role.SOURCE or (kind == "flag" and plan.numbers is None):
         not_available = None
         error = None
-    low, high = _sent_limits(plan)
-    names = {}
-    for value, word in sorted((signal.choices or {}).items()):
-        if value not in (not_available, error):
-            names[int(value)] = str(word)
-    esc = None
-    if plan.esc is not None and len(escs) > 1:
-        esc = escs[plan.esc].name
-    shows = plan.role.value
-    if plan.source is not None:
-        shows = plan.source.name
+    raws = plan.limits if plan.is_float else (plan.low, plan.high)
+    low, high = sorted(float(raw * plan.factor + plan.offset) for raw in raws)
+    choices = sorted((signal.choices or {}).items())
     comment = _line(signal.comment)
     notes = [note for note in _notes(message, plan) if note.lower() not in comment.lower()]
     sentences = [comment, *notes]
@@ -164,7 +163,7 @@ def _signal(
         "signal": plan.name,
         "start": signal.start,
         "bits": plan.length,
-        "type": "flag" if is_flag else _number_type(plan),
+        "type": kind,
         "big_endian": signal.byte_order == "big_endian",
         "page": plan.page,
         "factor": number(plan.factor),
@@ -174,30 +173,13 @@ def _signal(
         "unit": plan.unit,
         "not_available": not_available,
         "error": error,
-        "shows": shows,
-        "esc": esc,
+        "shows": plan.role.value if plan.source is None else plan.source.name,
+        "esc": esc_names.get(plan.esc),
         "meaning": " ".join(filter(None, sentences)),
-        "names": names,
+        "names": {
+            int(value): str(word) for value, word in choices if value not in (not_available, error)
+        },
     }
-
-
-def _is_flag(plan: SignalPlan) -> bool:
-    is_bit = plan.length == 1 and not plan.signed
-    return is_bit and plan.factor == 1 and plan.offset == 0
-
-
-def _sent_limits(plan: SignalPlan) -> list[float]:
-    """Return the least and the greatest physical value that can be sent."""
-    limits: Sequence[float | Fraction] = (plan.low, plan.high)
-    if plan.is_float:
-        limits = plan.limits
-    return sorted(float(raw * plan.factor + plan.offset) for raw in limits)
-
-
-def _number_type(plan: SignalPlan) -> str:
-    if plan.is_float:
-        return "float"
-    return "signed" if plan.signed else "unsigned"
 
 
 def _notes(message: MessagePlan, plan: SignalPlan) -> list[str]:
@@ -243,60 +225,22 @@ class Text(NamedTuple):
     remedy: str = "Nothing to do."
 
 
-LINK_STATES: Mapping[LinkState, Text] = {
-    LinkState.NEVER_SEEN: Text(
-        "nothing was received since the start",
-        "Switch the ESC on. Check the cable and the telemetry setting of the ESC. "
-        "A KOSMIK sends after one throttle pulse.",
-    ),
-    LinkState.SEARCHING: Text(
-        "bytes are received, but no valid frame yet",
-        "If this persists: the ESC may be set to another protocol, or the line is disturbed. "
-        "The log and decode show the probable cause.",
-    ),
-    LinkState.OK: Text("valid frames are received"),
-    LinkState.DEGRADED: Text(
-        "valid frames are received, with many CRC errors or dropped bytes",
-        GatewayError.CRC_RATE.remedy,
-    ),
-    LinkState.LOST: Text(
-        "valid frames were received earlier, but none now",
-        GatewayError.TELEMETRY_LOST.remedy,
-    ),
-    LinkState.PORT_ERROR: Text(
-        "the serial port cannot be opened or read",
-        GatewayError.PORT_GONE.remedy,
-    ),
-}
-CAN_STATES: Mapping[CanState, Text] = {
-    CanState.UNKNOWN: Text("the CAN interface does not report it"),
-    CanState.ERROR_ACTIVE: Text("works without errors"),
-    CanState.ERROR_WARNING: Text(
-        "works, but there are errors on the bus",
-        GatewayError.CAN_PASSIVE.remedy,
-    ),
-    CanState.ERROR_PASSIVE: Text(
-        "works, with many errors on the bus",
-        GatewayError.CAN_PASSIVE.remedy,
-    ),
-    CanState.BUS_OFF: Text(
-        "switched off because of errors on the bus, so no frame can be sent",
-        f"{GatewayError.BUS_OFF_LEFT.remedy} With restart-ms 0, restart the interface by hand.",
-    ),
-    CanState.DOWN: Text(
-        "the CAN interface is down or missing, so no frame can be sent",
-        "Plug in the adapter, and set the interface up. kontronik-can-gw doctor shows the command.",
-    ),
-}
-GATEWAY_STATES: Mapping[GatewayState, Text] = {
-    GatewayState.STARTING: Text("opening its ports and the CAN interface"),
-    GatewayState.RUNNING: Text("running"),
-    GatewayState.STOPPING: Text("shutting down"),
-    GatewayState.REPLAY: Text("the values come from a recording, not from an ESC"),
-    GatewayState.QUIET: Text(
-        "no ESC was heard for can.quiet_after_s, so only requests are answered until one is heard"
-    ),
-}
+_REMEDIES = {error.name: error.remedy for error in GatewayError}
+_STATES = tomllib.loads(Path(__file__).with_name("states.toml").read_text(encoding="ascii"))
+
+
+def _texts_of(states: Any, kind: str) -> dict[Any, Text]:
+    """Return the meanings and remedies of the states of an enumeration."""
+    found = {}
+    for name, row in _STATES[kind].items():
+        text = Text(**row)
+        found[states[name]] = text._replace(remedy=text.remedy.format(**_REMEDIES))
+    return found
+
+
+LINK_STATES: Mapping[LinkState, Text] = _texts_of(LinkState, "link")
+CAN_STATES: Mapping[CanState, Text] = _texts_of(CanState, "can")
+GATEWAY_STATES: Mapping[GatewayState, Text] = _texts_of(GatewayState, "gateway")
 
 
 def values(escs: Sequence[EscSettings]) -> list[MarkdownTable]:
@@ -385,44 +329,42 @@ def place(index: int, sub: int) -> str:
 
 def _errors(title: str, text: str, protocols: Sequence[EscProtocol]) -> MarkdownTable:
     word = title.lower().replace(" ", "_")
-    rows = []
-    for protocol in protocols:
-        for bit in protocol.errors.get(word, ()):
-            row = {
-                "bit": int(bit),
-                "name": bit.text,
-                "severity": bit.severity.value,
-                "meaning": bit.meaning,
-                "remedy": bit.remedy,
-            }
-            rows.append(row)
+    rows = [
+        {
+            "bit": int(bit),
+            "name": bit.text,
+            "severity": bit.severity.value,
+            "meaning": bit.meaning,
+            "remedy": bit.remedy,
+        }
+        for protocol in protocols
+        for bit in protocol.errors.get(word, ())
+    ]
     return MarkdownTable(title, [text], rows)
 
 
 def _states(title: str, states: Iterable[tuple[int, str, Text | StateText]]) -> MarkdownTable:
-    rows = []
-    for value, name, state in states:
-        row = {
+    rows = [
+        {
             "value": int(value),
             "name": name,
             "meaning": state.meaning,
             "remedy": state.remedy,
         }
-        rows.append(row)
+        for value, name, state in states
+    ]
     return MarkdownTable(f"{title} states", [], rows)
 
 
 def _device(protocol: EscProtocol, device: int) -> Row:
     """Return the row of a device. ``peak_current_of`` is None if it is unknown."""
-    not_supplied = []
-    for field in protocol.fields:
-        if not field.is_info and device in field.not_on:
-            not_supplied.append(field.name)
     return {
         "value": device,
         "name": protocol.devices[device],
         "peak_current_of": protocol.peak_current_of.get(device),
-        "not_supplied": not_supplied,
+        "not_supplied": [
+            field.name for field in protocol.fields if not field.is_info and device in field.not_on
+        ],
     }
 
 

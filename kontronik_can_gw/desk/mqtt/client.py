@@ -137,7 +137,12 @@ class MqttClient:
         client.on_connect = self._on_connect
         client.on_connect_fail = self._on_connect_fail
         client.on_disconnect = self._on_disconnect
-        client.will_set(online, OFFLINE, qos=1, retain=True)
+        client.will_set(
+            online,
+            OFFLINE,
+            qos=1,
+            retain=True,
+        )
         self._client = client
         if config.tls:
             self._use_tls()
@@ -189,7 +194,7 @@ class MqttClient:
 
     def offer(self, message: Publication) -> None:
         """Queue a message. It replaces a waiting message of the same topic."""
-        if message.lasting:
+        if message.is_lasting:
             self._lasting[message.topic] = message
         self._waiting[message.topic] = message
 
@@ -226,7 +231,7 @@ class MqttClient:
             self._ended.wait(max(0.0, end - time.monotonic()))
 
     def _send(self, message: Publication) -> paho.MQTTMessageInfo:
-        qos = 1 if message.lasting else 0
+        qos = 1 if message.is_lasting else 0
         return self._client.publish(message.topic, message.payload, qos, message.retain)
 
     # --- paho's thread

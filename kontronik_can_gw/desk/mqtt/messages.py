@@ -21,8 +21,7 @@ from typing import Any, NamedTuple
 
 from kontronik_can_gw.config.keys import MqttConfig
 from kontronik_can_gw.desk.mqtt.discovery import device
-from kontronik_can_gw.desk.mqtt.published import Published
-from kontronik_can_gw.desk.mqtt.topics import Topics
+from kontronik_can_gw.desk.mqtt.published import Published, Topics
 from kontronik_can_gw.desk.receiver.unpacker import SignalReader
 from kontronik_can_gw.desk.receiver.view import View
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
@@ -38,7 +37,7 @@ class Publication(NamedTuple):
 
     topic: str
     payload: bytes
-    lasting: bool = False
+    is_lasting: bool = False
     """True if the message is published again after each reconnection."""
     retain: bool = False
     """True if the broker keeps the message for later subscribers."""
@@ -54,17 +53,13 @@ class Publisher:
         self._topics = topics
         self._config = config
         self._view = View(SignalReader(bus.layout))
-        indices = set()
-        for column in self._view.reader.columns:
-            if column.esc is not None:
-                indices.add(column.esc)
         self._members = [Published(self._view, None, None)]
-        for index in sorted(indices):
-            self._members.append(Published(self._view, bus.escs[index], index))
-        self._member_of_sign: dict[int, Published] = {}
+        escs = {column.esc for column in self._view.reader.columns}
+        for index, settings in enumerate(bus.escs):
+            if index in escs:
+                self._members.append(Published(self._view, settings, index))
+        self._member_of_sign = {at: member for member in self._members for at in member.signs}
         """The member whose telemetry a value in a column proves."""
-        for member in self._members:
-            self._member_of_sign |= dict.fromkeys(member.signs, member)
         self._lasting: dict[str, bytes] = {}
         """The last payload of each topic with lasting messages."""
 
@@ -91,14 +86,9 @@ class Publisher:
             if not member.is_due(now, period_ns):
                 continue
             found += self._changed(self._lasting_of(member, now))
-            state = {"time": iso(wall_ns)}
-            state |= member.document(now)
-            publication = Publication(
-                self._topics.of(member.name, "state"),
-                _json(state),
-                retain=self._config.retain,
-            )
-            found.append(publication)
+            topic = self._topics.of(member.name, "state")
+            state = _json({"time": iso(wall_ns)} | member.document(now))
+            found.append(Publication(topic, state, retain=self._config.retain))
         return found
 
     def _changed(self, payloads: dict[str, bytes]) -> Iterator[Publication]:
@@ -106,14 +96,12 @@ class Publisher:
         for topic, payload in payloads.items():
             if self._lasting.get(topic) != payload:
                 self._lasting[topic] = payload
-                yield Publication(topic, payload, lasting=True, retain=True)
+                yield Publication(topic, payload, is_lasting=True, retain=True)
 
     def _lasting_of(self, member: Published, now: int) -> dict[str, bytes]:
         """Return availability, and discovery if it has changed, as payloads by topic."""
         topic = self._topics.of(member.name, "available")
-        found = {topic: OFFLINE}
-        if member.is_available(now):
-            found[topic] = ONLINE
+        found = {topic: ONLINE if member.is_available(now) else OFFLINE}
         prefix = self._config.discovery
         if prefix is not None and member.update_identity():
             topic = self._topics.discovery(prefix, member.name)
@@ -127,7 +115,5 @@ def _json(content: dict[str, Any]) -> bytes:
 
 def iso(wall_ns: int) -> str:
     """Return a Unix time as ISO 8601 in UTC, with milliseconds."""
-    seconds = wall_ns // MS / 1000
-    moment = datetime.fromtimestamp(seconds, UTC)
-    text = moment.isoformat(timespec="milliseconds")
-    return text.replace("+00:00", "Z")
+    moment = datetime.fromtimestamp(wall_ns // MS / 1000, UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,9 +1,10 @@
-"""The gateway or an ESC as it is published: the content of its messages and their timing.
+"""The gateway or an ESC as it is published: topics, content of its messages and their timing.
 
 No I/O, no clock: time is an argument.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from kontronik_can_gw.desk.member import Alarm, Member
@@ -22,6 +23,28 @@ _FIRST_NS = SECOND // 2
 """Delay of the first state, in which the first frames of all messages can arrive."""
 
 
+@dataclass(frozen=True)
+class Topics:
+    """The topics of one gateway. An empty ``esc`` stands for the gateway itself."""
+
+    prefix: str
+    gateway: str
+
+    def of(self, *levels: str) -> str:
+        """Return a topic of this gateway. Empty levels are left out."""
+        path = (self.prefix, self.gateway, *levels)
+        return "/".join(filter(None, path))
+
+    def discovery(self, prefix: str, esc: str = "") -> str:
+        """Return the topic of a device's discovery below Home Assistant's ``prefix``."""
+        return f"{prefix}/device/{self.identifier(esc)}/config"
+
+    def identifier(self, esc: str = "") -> str:
+        """Return Home Assistant's identifier of a device. It depends on the two names only."""
+        words = ("kontronik", self.gateway, esc)
+        return "_".join(filter(None, words))
+
+
 class Published(Member):
     """The gateway or an ESC, with the content of its messages and their timing."""
 
@@ -37,10 +60,9 @@ class Published(Member):
         """Time of the newest value in these columns."""
         self.identity: tuple[str | None, str | None] | None = None
         """Device and firmware of the published discovery."""
-        self._kinds: dict[str, str | None] = {}
+        states = self.protocol.states.values()
+        self._kinds = {normalize(state.text): state.kind for state in states}
         """Kind of each operating state by its name."""
-        for state in self.protocol.states.values():
-            self._kinds[normalize(state.text)] = state.kind
         self._due: int | None = None
         """Time of the next state at the fixed rate. None before the first call of ``is_due``."""
         self._published_notable: tuple[object, ...] | None = None
@@ -89,15 +111,10 @@ class Published(Member):
 
     def document(self, now: int) -> dict[str, Any]:
         """Return the content of the state: all values, and their age in ms."""
-        heard_ns = self.heard_ns
-        if self.index is None:
-            heard_ns = self.view.last_ns
-        age_ms = None
-        if heard_ns is not None:
-            age_ms = (now - heard_ns) // MS
+        heard_ns = self.view.last_ns if self.index is None else self.heard_ns
         found: dict[str, Any] = {
             "available": self.is_available(now),
-            "age": age_ms,
+            "age": None if heard_ns is None else (now - heard_ns) // MS,
         }
         values = {source: self.value(source) for source in self.no_flags}
         if self.index is None:
@@ -107,8 +124,7 @@ class Published(Member):
         found["errors"] = _describe(errors)
         found["problem"] = None
         if errors is not None:
-            severities = {error.severity for error in errors}
-            found["problem"] = Severity.ERROR in severities
+            found["problem"] = Severity.ERROR in {error.severity for error in errors}
         found["selftest"] = _describe(self.flags("selftest_errors"))
         found["link_state"] = None  # present even if the DBC has no signal for it
         found |= values
@@ -140,12 +156,11 @@ class Published(Member):
 def _describe(flags: Sequence[Alarm] | None) -> list[dict[str, str]] | None:
     if flags is None:
         return None
-    found = []
-    for flag in flags:
-        entry = {
+    return [
+        {
             "name": flag.text,
             "severity": flag.severity.value,
             "meaning": flag.meaning,
         }
-        found.append(entry)
-    return found
+        for flag in flags
+    ]
