@@ -46,15 +46,12 @@ def exported(
         core_h, count = re.subn(rf"(#define {name} +)\d+", rf"\g<1>{value}", core_h)
         assert count == 1, name
     names = _names("KCG_MESSAGE_", tables.names["message"])
-    messages = []
-    for name, row in zip(names, tables.messages, strict=True):
-        short = name.removeprefix("KCG_MESSAGE_")
-        messages.append(f"| {short} | {_id(row)} | {row.length} |")
-    _, _, file_name = layout.file.rpartition("/")
-    dbc = _plain(file_name)
-    size = 0
-    for kind, rows in tables.arrays.values():
-        size += ctypes.sizeof(kind) * len(rows)
+    messages = [
+        f"| {name.removeprefix('KCG_MESSAGE_')} | {_id(row)} | {row.length} |"
+        for name, row in zip(names, tables.messages, strict=True)
+    ]
+    dbc = _plain(layout.file.rpartition("/")[2])
+    size = sum(ctypes.sizeof(kind) * len(rows) for kind, rows in tables.arrays.values())
     words = {
         "dbc": dbc,
         "messages": "\n".join(messages),
@@ -138,7 +135,10 @@ def _tables(tables: Tables) -> Iterator[str]:
     yield '#include "tables.h"'
     for name, (kind, rows) in tables.arrays.items():
         label = tables.names.get(name)
-        yield f"\nstatic const {_type(name, kind)} {name}[] = {{"
+        c_type = f"uint{8 * ctypes.sizeof(kind)}_t"
+        if issubclass(kind, ctypes.Structure):
+            c_type = f"kcg_{name}"
+        yield f"\nstatic const {c_type} {name}[] = {{"
         yield from _rows(kind, rows or [kind()], label)
         yield "};"
     yield "\nconst kcg_settings kcg_esc_settings[KCG_ESCS] = {"
@@ -149,12 +149,6 @@ def _tables(tables: Tables) -> Iterator[str]:
     yield f"    {', '.join(addresses)},"
     yield f"    {', '.join(numbers)}"
     yield "};\n"
-
-
-def _type(name: str, kind: Any) -> str:
-    if issubclass(kind, ctypes.Structure):
-        return f"kcg_{name}"
-    return f"uint{8 * ctypes.sizeof(kind)}_t"
 
 
 def _rows(
@@ -224,4 +218,9 @@ def _forms(name: str) -> list[str]:
 
 def _plain(text: str) -> str:
     """Return ASCII text that can be in a comment or on a page without ending it."""
-    return re.sub(r"[^\w .,+()-]", "_", text, flags=re.ASCII)
+    return re.sub(
+        r"[^\w .,+()-]",
+        "_",
+        text,
+        flags=re.ASCII,
+    )

@@ -22,38 +22,21 @@ EXTRAS = {
 def missing_library(purpose: str, extra: str) -> RunError:
     """The error for a command that needs the library of an extra."""
     requirement = EXTRAS[extra]
-    if _is_system_python():
-        advice = f"The Debian package leaves it out. {_clone_advice(extra)}"
-    else:
-        advice = f"Install it: {install_command(requirement)}"
+    advice = f"Install it: {install_command(requirement)}"
+    marker = Path(sysconfig.get_path("stdlib"), "EXTERNALLY-MANAGED")
+    # Python is the system's and refuses pip (PEP 668), as with the Debian package
+    if sys.prefix == sys.base_prefix and marker.exists():
+        advice = (
+            "The Debian package leaves it out. In a clone of the sources: "
+            f"python3 -m venv ~/kontronik && ~/kontronik/bin/pip install '.[{extra}]'. "
+            "Then run ~/kontronik/bin/kontronik-can-gw."
+        )
     return RunError(f"{purpose} needs {requirement}. {advice}")
-
-
-def _clone_advice(extra: str) -> str:
-    return (
-        "In a clone of the sources: "
-        f"python3 -m venv ~/kontronik && ~/kontronik/bin/pip install '.[{extra}]'. "
-        "Then run ~/kontronik/bin/kontronik-can-gw."
-    )
 
 
 def install_command(requirement: str) -> str:
     """The command that installs or upgrades a library for the Python that runs."""
-    return _command("--upgrade", requirement)
-
-
-def _command(option: str, requirement: str) -> str:
     quoted = " ".join(f"'{each}'" for each in requirement.split())
-    if _is_in_pipx():
+    if {"pipx", "venvs"} <= set(Path(sys.prefix).parts):
         return f"pipx inject --force kontronik-can-gw {quoted}"
-    return f"{sys.executable} -m pip install {option} {quoted}"
-
-
-def _is_in_pipx() -> bool:
-    return {"pipx", "venvs"} <= set(Path(sys.prefix).parts)
-
-
-def _is_system_python() -> bool:
-    """Whether Python is the system's and refuses pip (PEP 668), as with the Debian package."""
-    marker = Path(sysconfig.get_path("stdlib"), "EXTERNALLY-MANAGED")
-    return sys.prefix == sys.base_prefix and marker.exists()
+    return f"{sys.executable} -m pip install --upgrade {quoted}"

@@ -45,8 +45,8 @@ class Source:
     """A source of frames with their times."""
 
     is_file = False
-    ended = False
-    paused = False
+    has_ended = False
+    is_paused = False
     problem = ""
     """The reason why frames cannot be received, in one line. Empty while they can be received."""
     hints: tuple[str, ...] = ()
@@ -134,7 +134,7 @@ class _FramesAhead:
         self._frames = frames
         self._read: queue.Queue[TimedFrame | None] = queue.Queue(1000)
         self._problem: Exception | None = None
-        self.have_ended = False
+        self.has_ended = False
         Thread(target=self._read_all, daemon=True).start()
 
     def take(self) -> TimedFrame | None:
@@ -147,15 +147,15 @@ class _FramesAhead:
         except queue.Empty:
             return None
         if found is None:
-            self.have_ended = True
+            self.has_ended = True
             if self._problem is not None:
                 raise self._problem
         return found
 
     def close(self) -> None:
         """Wait for the thread. The stream must have been ended."""
-        while not self.have_ended:
-            self.have_ended = self._read.get() is None
+        while not self.has_ended:
+            self.has_ended = self._read.get() is None
 
     def _read_all(self) -> None:
         try:
@@ -195,10 +195,10 @@ class PlayedRecording(Source):
         """Fetch the next frame, if it has arrived."""
         if self._ahead is None:
             self._next = next(self._frames, None)
-            self.ended = self._next is None
+            self.has_ended = self._next is None
         else:
             self._next = self._ahead.take()
-            self.ended = self._ahead.have_ended
+            self.has_ended = self._ahead.has_ended
         if not self._has_begun and self._next is not None:
             self._has_begun = True
             self._first_ns = self._next.time_ns
@@ -217,7 +217,7 @@ class PlayedRecording(Source):
         passed_s = min(begin - self._last_pump, _MAX_LAG_S)
         self._last_pump = begin
         pause = _LONGEST_SLEEP_S
-        if not self.paused and not self.ended:
+        if not self.is_paused and not self.has_ended:
             if self._next is None:
                 self._advance()
             clock = self._clock
@@ -230,7 +230,7 @@ class PlayedRecording(Source):
                 if time.monotonic() >= until_s:
                     break
             else:
-                if not self.ended and not self._at_once:  # the clock stops at the end
+                if not self.has_ended and not self._at_once:  # the clock stops at the end
                     self._clock = clock
                 if self._next is not None:
                     wait_s = (self._next.time_ns - clock) / SECOND / self._speed
@@ -248,9 +248,9 @@ class PlayedRecording(Source):
         parts = [f"{seconds // 60}:{seconds % 60:02}"]
         if self._speed != 1:
             parts.append(f"x{self._speed:g}")
-        if self.ended:
+        if self.has_ended:
             parts.append("END OF FILE")
-        if self.paused:
+        if self.is_paused:
             parts.append("PAUSED")
         return "  ".join(parts)
 

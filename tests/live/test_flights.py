@@ -20,7 +20,7 @@ from recordings import capture_bytes
 from kontronik_can_gw.desk.live import flights as flights_module
 from kontronik_can_gw.desk.live.flights import Flights, recordings_in
 from kontronik_can_gw.desk.recordings.inputs import open_input
-from kontronik_can_gw.desk.report.recorded import flight_of
+from kontronik_can_gw.desk.report.flight import flight_of
 
 pytestmark = pytest.mark.promise("live-page")
 

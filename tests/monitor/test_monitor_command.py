@@ -141,7 +141,7 @@ def test_recording_is_played_in_real_time(log: Path, clock: Clock, speed: float)
         def take(_: object, now: int) -> None:
             late.append(clock.now - begun - (now - first) / SECOND_NS / speed)
 
-        while not recording.ended:
+        while not recording.has_ended:
             recording.pump(take, clock.now + 0.1)
     assert len(late) == len(flight(ONE, 12))
     assert -1e-6 <= min(late) <= max(late) <= 0.11

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from rich.text import Text
 from simulated_bus import flight, layout_of, with_errors
 
-from kontronik_can_gw.desk.monitor.charts import sparkline
 from kontronik_can_gw.desk.monitor.lines import number, shorten
 from kontronik_can_gw.desk.monitor.model import Monitor
-from kontronik_can_gw.desk.monitor.screen import screen
+from kontronik_can_gw.desk.monitor.screen import screen, sparkline
 from kontronik_can_gw.desk.monitor.watch import obey
 from kontronik_can_gw.desk.quantities import QUANTITIES, Quantity
 from kontronik_can_gw.desk.recordings.layouts import BusLayout

@@ -5,6 +5,7 @@ and blocks of an unknown kind, cannot be checked. They are left out and counted.
 """
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from typing import Any
 
 from kontronik_can_gw.capture.format import Damage, Scanner, block, json_payload, read_json
@@ -17,10 +18,7 @@ def clean_capture(
 ) -> Iterator[bytes]:
     """Yield the bytes of a capture's copy. Without its DBC, a replay sends no messages of a DBC."""
     scanner = Scanner()
-    for data in chunks:
-        for found in scanner.feed(data):
-            yield _clean(found, part, cleaner, with_dbc)
-    for found in scanner.flush():
+    for found in chain(chain.from_iterable(map(scanner.feed, chunks)), scanner.flush()):
         yield _clean(found, part, cleaner, with_dbc)
 
 

@@ -107,13 +107,8 @@ def _is_harmless(table: str, key: str, value: str) -> bool:
         is_known = path[1] in rows and path[:2] != list(OPTIONS)
     else:
         is_known = path[0] in TABLES and OPTIONS[1] not in value
-    return is_known or is_harmless_option(path[-1], value)
-
-
-def is_harmless_option(name: str, value: str) -> bool:
-    """Return True if the value of an interface's option, as TOML, cannot be a secret."""
-    is_rate = _OPTION_OF_RATE.fullmatch(name) and _NUMBER.fullmatch(value)
-    return value in ("true", "false") or is_rate is not None
+    is_rate = _OPTION_OF_RATE.fullmatch(path[-1]) and _NUMBER.fullmatch(value)
+    return is_known or value in ("true", "false") or is_rate is not None
 
 
 def tables_of(text: str) -> dict[str, object]:

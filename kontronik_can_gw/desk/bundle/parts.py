@@ -82,7 +82,8 @@ class Contents:
         except UserError as error:
             self.missing.append(f"{name}: {'; '.join(error.problems)}")
         except OSError as error:
-            self.missing.append(f"{name}: {error.filename or ''}: {error.strerror}{_advice(error)}")
+            advice = ". Run doctor with sudo." if isinstance(error, PermissionError) else ""
+            self.missing.append(f"{name}: {error.filename or ''}: {error.strerror}{advice}")
         except Exception as error:  # a bug in one part must not prevent the others
             self.missing.append(f"{name}: fault of the program: {error!r}")
 
@@ -109,10 +110,6 @@ class Contents:
             self.add(name, data)
             if data == original:
                 self.digests[str(path)] = self.digests[name]
-
-
-def _advice(error: OSError) -> str:
-    return ". Run doctor with sudo." if isinstance(error, PermissionError) else ""
 
 
 def _read(path: Path, limit: int) -> bytes:
@@ -302,11 +299,15 @@ def add_versions(contents: Contents, machine: Machine, made: str) -> None:
     system = next(
         (line for line in release.splitlines() if line.startswith("PRETTY_NAME=")), "PRETTY_NAME=?"
     )
+    try:
+        core = hashlib.sha256(shared_object().read_bytes()).hexdigest()
+    except OSError as error:
+        core = reason_of(error)
     versions = {
         "made": made,
         "kontronik-can-gw": __version__,
         "program": _program_digest(),
-        "core": _file_digest(shared_object()),
+        "core": core,
         "python": sys.version,
         "system": system.partition("=")[2].strip('"'),
         "kernel": f"{platform.release()} {platform.machine()}",
@@ -331,10 +332,3 @@ def _program_digest() -> str:
     for path in sorted(package.rglob("*.py")):
         found.update(os.fsencode(path.relative_to(package)) + b"\0" + path.read_bytes())
     return found.hexdigest()
-
-
-def _file_digest(path: Path) -> str | None:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        return reason_of(error)

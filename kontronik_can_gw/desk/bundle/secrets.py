@@ -114,7 +114,9 @@ class Cleaner:
         text = self.known(text, part)
         for kind, form in _FORMS.items():
             if with_hex or kind != "hexadecimal key":
-                text, number = form.subn(_replacement, text)
+                text, number = form.subn(
+                    lambda found: f"{REMOVED}@" if found[0].endswith("@") else REMOVED, text
+                )
                 self.count(part, kind, number)
         return text
 
@@ -152,14 +154,11 @@ class Cleaner:
         return line
 
 
-def _replacement(found: re.Match[str]) -> str:
-    return f"{REMOVED}@" if found[0].endswith("@") else REMOVED
-
-
 def _pattern_of(value: str) -> re.Pattern[str]:
     """Return a pattern of all spellings of a value: as it is, escaped, or in a URL."""
     spellings: set[str] = set()
-    for text in (value, _as_latin_1(value)):
+    # in captures, UTF-8 is read as Latin-1
+    for text in (value, value.encode("utf-8", "replace").decode("latin-1")):
         spellings |= {text, quote(text, safe=""), quote(text), repr(text)[1:-1]}
         spellings |= {json.dumps(text)[1:-1], json.dumps(text, ensure_ascii=False)[1:-1]}
     longest_first = sorted(spellings, key=len, reverse=True)
@@ -168,11 +167,6 @@ def _pattern_of(value: str) -> re.Pattern[str]:
     if len(value) < _SHORT:
         return re.compile(rf"(?<![^\W_])(?:{parts})(?![^\W_])")
     return re.compile(parts)
-
-
-def _as_latin_1(value: str) -> str:
-    """Return the text that a reader of Latin-1 gets from UTF-8, as in captures."""
-    return value.encode("utf-8", "replace").decode("latin-1")
 
 
 def values_of_secrets(tables: Any, path: str = "") -> Iterable[tuple[str, str]]:

@@ -3,11 +3,13 @@
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
+from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.desk.conformance import (
     eds_items,
     emergency_items,
@@ -18,6 +20,7 @@ from kontronik_can_gw.desk.conformance import (
     sdo_items,
     storage_items,
 )
+from kontronik_can_gw.desk.conformance.eds_file import EdsFile
 from kontronik_can_gw.desk.conformance.items import Skipped, Wrong
 from kontronik_can_gw.desk.conformance.nmt_items import RESET_NODE
 from kontronik_can_gw.desk.conformance.slave import (
@@ -26,7 +29,9 @@ from kontronik_can_gw.desk.conformance.slave import (
     Slave,
     UnexpectedAnswer,
 )
-from kontronik_can_gw.errors import UserError, did_you_mean
+from kontronik_can_gw.errors import RunError, UserError, did_you_mean
+from kontronik_can_gw.light_imports import without_asammdf
+from kontronik_can_gw.runtime.can.open_can import open_can
 
 _TEXTS = Path(__file__).with_name("items.toml")
 _GROUPS = {
@@ -175,7 +180,37 @@ def _run_item(slave: Slave, item: Item, reason: str) -> Result:
         verdict = ItemVerdict.DEVIATES
     else:
         reason = ""
-    return Result(item, answer, verdict, reason, slave.clock() - begun_s)
+    return Result(
+        item,
+        answer,
+        verdict,
+        reason,
+        slave.clock() - begun_s,
+    )
+
+
+@contextmanager
+def slave_on_bus(
+    interface: str, channel: str, node_id: int, eds: EdsFile, limit_s: float
+) -> Iterator[Slave]:
+    """Open the bus. Raises RunError if it cannot be opened or the slave does not answer."""
+    open_can(CanConfig(interface=interface, channel=channel)).close()  # raises with a remedy
+    with without_asammdf():
+        import can
+    try:
+        bus = can.Bus(interface=interface, channel=channel)
+    except Exception as error:  # the drivers raise exceptions of any kind
+        raise RunError(f"CAN {channel}: cannot be opened: {error}.") from None
+    with bus:
+        slave = Slave(bus, node_id, eds, limit_s)
+        try:
+            slave.read(0x1000)
+        except NoAnswer:
+            raise RunError(
+                f"node {node_id} on {channel}: does not answer. Is it on this bus, and is "
+                "the bit rate right?"
+            ) from None
+        yield slave
 
 
 def counts(results: Sequence[Result]) -> str:

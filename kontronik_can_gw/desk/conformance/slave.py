@@ -65,7 +65,7 @@ class Slave:
         self.limit_s = limit_s
         self.clock = clock
         """Returns the time in seconds. The bus waits by the same clock."""
-        self.sends_boot_up = True
+        self.has_boot_up = True
         """False after a reset without a boot-up message. Then no further one is waited for."""
         self.other_nodes: set[int] = set()
         """Node-IDs of other slaves whose boot-up messages or heartbeats were received."""
@@ -167,10 +167,10 @@ class Slave:
         self.nmt(command)
         frames: list[ReceivedFrame] = []
         until_s = self.clock() + self.limit_s
-        while self.sends_boot_up:
+        while self.has_boot_up:
             frame = self.receive(until_s)
             if frame is None:
-                self.sends_boot_up = False
+                self.has_boot_up = False
                 break
             frames.append(frame)
             if frame.can_id == self.heartbeat_id and frame.data == b"\0":

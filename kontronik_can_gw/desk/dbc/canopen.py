@@ -6,7 +6,6 @@ sign bit set).
 """
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 from kontronik_can_gw.canopen.bound_values import message_plan
 from kontronik_can_gw.canopen.cob_ids import HEARTBEAT
@@ -120,26 +119,20 @@ def _about(nodes: Nodes, escs: Sequence[EscSettings]) -> str:
 # --- messages of a node
 
 
-class _Schedule(NamedTuple):
-    """The send type of a message, with its period and its minimum delay time in ms."""
-
-    send_type: str
-    cycle_ms: int = 0
-    delay_ms: int = 0
-
-
 def _message(
     stem: str,
     cob_id: int,
     length: int,
     comment: str,
-    schedule: _Schedule,
+    send_type: str,
     signals: Sequence[SignalRow],
+    cycle_ms: int = 0,
+    delay_ms: int = 0,
 ) -> MessageRow:
     attributes: dict[str, object] = {
-        "GenMsgCycleTime": schedule.cycle_ms,
-        "GenMsgSendType": schedule.send_type,
-        "GenMsgDelayTime": schedule.delay_ms,
+        "GenMsgCycleTime": cycle_ms,
+        "GenMsgSendType": send_type,
+        "GenMsgDelayTime": delay_ms,
     }
     return MessageRow(
         cob_id,
@@ -178,19 +171,17 @@ def _heartbeat(node: Node) -> MessageRow:
         high=NmtState.PRE_OPERATIONAL,
         texts=states,
     )
+    when = "off (1017h is 0), only the boot-up message is sent"
     if period_ms:
-        schedule = _Schedule("Cyclic", cycle_ms=period_ms)
         when = f"every {period_ms} ms"
-    else:
-        schedule = _Schedule("Event")
-        when = "off (1017h is 0), only the boot-up message is sent"
     return _message(
         "Heartbeat",
         cob_id=HEARTBEAT + node.node_id,
         length=1,
         comment=f"Heartbeat of CANopen node {node.node_id}, {when}.",
-        schedule=schedule,
+        send_type="Cyclic" if period_ms else "Event",
         signals=[state],
+        cycle_ms=period_ms,
     )
 
 
@@ -229,6 +220,15 @@ def _emergency(node: Node) -> MessageRow:
         comment=about_word,
         high=0xFFFFFFFF,
     )
+    register = [
+        unsigned_signal(
+            f"ErrorRegister{name.title()}",
+            start=15 + mask.bit_length(),
+            length=1,
+            comment=f"Error register 1001h, {name.lower()} error.",
+        )
+        for name, mask in Register.__members__.items()
+    ]
     about = (
         f"Emergencies of CANopen node {node.node_id}, "
         "sent when an error begins. NoError is sent when all errors have ended."
@@ -238,20 +238,10 @@ def _emergency(node: Node) -> MessageRow:
         cob_id=node.emergencies.cob_id & 0x7FF,
         length=8,
         comment=about,
-        schedule=_Schedule("Event", delay_ms=node.dictionary.number(0x1015) // 10),
-        signals=[code, *_register_signals(), source, word],
+        send_type="Event",
+        signals=[code, *register, source, word],
+        delay_ms=node.dictionary.number(0x1015) // 10,
     )
-
-
-def _register_signals() -> Iterator[SignalRow]:
-    """Yield a signal for each bit of the error register in an emergency."""
-    for name, mask in Register.__members__.items():
-        yield unsigned_signal(
-            f"ErrorRegister{name.title()}",
-            start=15 + mask.bit_length(),
-            length=1,
-            comment=f"Error register 1001h, {name.lower()} error.",
-        )
 
 
 def _tpdo(tpdo: Tpdo, node: Node) -> MessageRow:
@@ -261,14 +251,16 @@ def _tpdo(tpdo: Tpdo, node: Node) -> MessageRow:
         signals += signals_of(variable, place, node.esc.protocol)
     number = tpdo.number + 1
     comment = f"TPDO {number} of CANopen node {node.node_id}."
+    send_type = "None"
+    cycle_ms = 0
+    delay_ms = 0
     if tpdo.type in EVENT_TYPES:
         cycle_ms = tpdo.event_ns // MS
+        delay_ms = tpdo.inhibit_ns // MS
         send_type = "OnChange" if tpdo.on_change else "Event"
         if cycle_ms:
             send_type = f"CyclicAnd{send_type}"
-        schedule = _Schedule(send_type, cycle_ms, tpdo.inhibit_ns // MS)
     else:
-        schedule = _Schedule("None")
         which = f"every SYNC number {tpdo.type}" if tpdo.type else "the next SYNC after a change"
         comment += f" Sent at {which}."
     return _message(
@@ -276,6 +268,8 @@ def _tpdo(tpdo: Tpdo, node: Node) -> MessageRow:
         cob_id=tpdo.cob_id,
         length=plan.length,
         comment=comment,
-        schedule=schedule,
+        send_type=send_type,
         signals=signals,
+        cycle_ms=cycle_ms,
+        delay_ms=delay_ms,
     )

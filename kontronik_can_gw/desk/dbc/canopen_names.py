@@ -37,7 +37,9 @@ def pascal_case(text: str) -> str:
     """
     parts = []
     for word in re.split("[^A-Za-z0-9]+", text):
-        capitalized = re.sub("[A-Z]+(?=[A-Z][a-z]|[^a-z]*$)", _capitalized, word)
+        capitalized = re.sub(
+            "[A-Z]+(?=[A-Z][a-z]|[^a-z]*$)", lambda match: match[0].capitalize(), word
+        )
         parts.append(capitalized[:1].upper() + capitalized[1:])
     return "".join(parts)
 
@@ -56,7 +58,3 @@ def emergency_names(bits: Sequence[ErrorBit]) -> dict[int, str]:
     code, _ = GatewayError.TELEMETRY_LOST.value
     names[code] = "TelemetryFault"
     return names
-
-
-def _capitalized(match: re.Match[str]) -> str:
-    return match[0].capitalize()

@@ -87,7 +87,13 @@ def signals_of(
     low = -(1 << place.length - 1) if place.signed else 0
     high = low + (1 << place.length) - 1
     if bound is not None:
-        _describe_value(signal, bound, protocol, low, high)
+        _describe_value(
+            signal,
+            bound,
+            protocol,
+            low,
+            high,
+        )
         if entry.index >= _MIRRORS:
             signal.name = _stem(entry)
         return [signal]
@@ -106,18 +112,16 @@ def _error_word(
     comment: str,
 ) -> list[SignalRow]:
     """Return a signal for each bit of an error word."""
-    signals = []
-    for bit in bits:
-        number = int(bit)
-        if number < length:
-            signal = unsigned_signal(
-                pascal_case(bit.name),
-                start=start + number,
-                length=1,
-                comment=f"{comment} Bit {number}, {bit.meaning}.",
-            )
-            signals.append(signal)
-    return signals
+    return [
+        unsigned_signal(
+            pascal_case(bit.name),
+            start=start + bit,
+            length=1,
+            comment=f"{comment} Bit {int(bit)}, {bit.meaning}.",
+        )
+        for bit in bits
+        if bit < length
+    ]
 
 
 def _describe_value(
@@ -205,10 +209,7 @@ def _complete(
     word: str,
 ) -> dict[int, str]:
     """Return a name for each number up to ``last``: its text, or ``word`` and the number."""
-    names = {}
-    for number in range(last + 1):
-        names[number] = pascal_case(texts.get(number, f"{word}{number}"))
-    return names
+    return {number: pascal_case(texts.get(number, f"{word}{number}")) for number in range(last + 1)}
 
 
 def _stem(entry: EdsEntry) -> str:

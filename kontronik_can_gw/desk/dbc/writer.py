@@ -114,10 +114,15 @@ def dbc_text(
         [f"VAL_TABLE_ {name} {_texts(table)} ;" for name, table in dbc.value_tables.items()],
     ]
     for message in messages:
-        lines = [_line(signal) for signal in _sorted(message)]
-        sections.append([_head(message), *lines])
+        sender = message.senders[0] if message.senders else NO_NODE
+        head = f"BO_ {message.key} {message.name}: {message.length} {sender}"
+        sections.append([head, *map(_line, _sorted(message))])
     sections += [
-        _further_senders(messages),
+        [
+            f"BO_TX_BU_ {message.key} : {','.join(message.senders)};"
+            for message in messages
+            if len(message.senders) > 1
+        ],
         list(_environment(dbc.environment_variables.values())),
         list(_comments(database, messages)),
         *_definitions(dbc),
@@ -128,15 +133,6 @@ def dbc_text(
     return "\n\n".join(texts) + "\n"
 
 
-def _further_senders(messages: Sequence[MessageRow]) -> list[str]:
-    """Return the lines of messages with several senders."""
-    lines = []
-    for message in messages:
-        if len(message.senders) > 1:
-            lines.append(f"BO_TX_BU_ {message.key} : {','.join(message.senders)};")
-    return lines
-
-
 def _definitions(dbc: Any) -> tuple[list[str], list[str]]:
     """Return the sections with the definitions and the defaults of attributes."""
     definitions: list[str] = []
@@ -145,9 +141,11 @@ def _definitions(dbc: Any) -> tuple[list[str], list[str]]:
     for suffix, table in kinds:
         for definition in table.values():
             definitions.append(f"BA_DEF_{suffix} {_definition(definition)};")
-            if definition.default_value is not None:
-                default = _default(definition)
-                defaults.append(f'BA_DEF_DEF_{suffix} "{definition.name}" {default};')
+            default = definition.default_value
+            if default is not None:
+                is_text = definition.type_name in ("STRING", "ENUM")
+                shown = f'"{_escaped(str(default))}"' if is_text else _number(default)
+                defaults.append(f'BA_DEF_DEF_{suffix} "{definition.name}" {shown};')
     return definitions, defaults
 
 
@@ -179,9 +177,7 @@ def _message(sent: Copy, data_ids: Sequence[int] | None = None) -> MessageRow:
     multiplexers = sum(signal.is_multiplexer for signal in message.signals)
     pages = [len(signal.multiplexer_ids or ()) for signal in message.signals]
     in_pages = max([multiplexers, *pages]) > 1
-    signals = []
-    for signal, name in sent.signals():
-        signals.append(_signal(signal, name, sent.prefix, in_pages))
+    signals = [_signal(signal, name, sent.prefix, in_pages) for signal, name in sent.signals()]
     groups = []
     for group in message.signal_groups or ():
         names = " ".join(sent.prefix + name for name in group.signal_names)
@@ -270,11 +266,6 @@ def _texts(table: Any) -> str:
     return " ".join(f'{number} "{_escaped(str(text))}"' for number, text in sorted(table.items()))
 
 
-def _head(message: MessageRow) -> str:
-    sender = message.senders[0] if message.senders else NO_NODE
-    return f"BO_ {message.key} {message.name}: {message.length} {sender}"
-
-
 def _line(signal: SignalRow) -> str:
     name = signal.name
     if signal.multiplexing:
@@ -329,13 +320,6 @@ def _definition(definition: Any) -> str:
     elif name != "STRING" and None not in limits:
         values = " ".join(map(_number, limits))
     return f'{kind} "{definition.name}" {name} {values}'.lstrip()
-
-
-def _default(definition: Any) -> str:
-    value = definition.default_value
-    if definition.type_name in ("STRING", "ENUM"):
-        return f'"{_escaped(str(value))}"'
-    return _number(value)
 
 
 def _value(value: Any, definition: Any) -> str:

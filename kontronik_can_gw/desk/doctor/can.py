@@ -58,8 +58,7 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
     flags = int(machine.text(f"{folder}/flags") or "0", 0)
     is_up = bool(flags & 1)
     findings.add("can.up", "ok" if is_up else "down")
-    mtu = int(machine.text(f"{folder}/mtu") or "0")
-    if can.fd and mtu < _FD_MTU:
+    if can.fd and int(machine.text(f"{folder}/mtu") or "0") < _FD_MTU:
         findings.add("can.fd", "off")
     if not link:
         findings.add("can.details", "no_ip")
@@ -73,8 +72,13 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
             _check_timing(findings, can, data, has_restart)
         _check_state(findings, data, has_restart)
         driver = machine.target_of(f"{folder}/device/driver").rpartition("/")[2]
-        if driver == _CRASHING_DRIVER and data.get("restart_ms", 0):
-            findings.add("can.restart", "may_crash", driver=driver, ms=data["restart_ms"])
+        if driver == _CRASHING_DRIVER and data.get("restart_ms"):
+            findings.add(
+                "can.restart",
+                "may_crash",
+                driver=driver,
+                ms=data["restart_ms"],
+            )
     if can.restart_after_s:
         watched = f"multi-user.target.wants/kontronik-can-gw-restart@{can.channel}.path"
         is_enabled = machine.target_of(f"/etc/systemd/system/{watched}")
@@ -84,10 +88,8 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
 
 def _report_missing(findings: Findings, machine: Machine, channel: str) -> None:
     """Report that no CAN interface has this name, and list the others."""
-    others = []
-    for name in machine.names(_NET):
-        if machine.text(f"{_NET}/{name}/type") == _CAN_TYPE:
-            others.append(name)
+    names = machine.names(_NET)
+    others = [name for name in names if machine.text(f"{_NET}/{name}/type") == _CAN_TYPE]
     case = "others" if others else "none"
     if machine.exists(f"{_NET}/{channel}"):
         case = "no_can"
@@ -98,7 +100,15 @@ def _report_missing(findings: Findings, machine: Machine, channel: str) -> None:
 
 def _link(machine: Machine, name: str) -> Mapping[str, Any]:
     """Return kind, bit timing and state of an interface. Empty if `ip` does not show them."""
-    shown = machine.run("ip", "-json", "-details", "link", "show", "dev", name)
+    shown = machine.run(
+        "ip",
+        "-json",
+        "-details",
+        "link",
+        "show",
+        "dev",
+        name,
+    )
     try:
         found: Mapping[str, Any] = json.loads(shown)[0].get("linkinfo", {})
     except (ValueError, LookupError):
@@ -129,7 +139,13 @@ def _check_timing(
         case = "other" if real else "none"
         if real == wanted:
             case = "ok"
-        findings.add("can.bitrate", case, key=key, wanted=wanted, real=real)
+        findings.add(
+            "can.bitrate",
+            case,
+            key=key,
+            wanted=wanted,
+            real=real,
+        )
     ms = data.get("restart_ms", 0)
     case = "slcan"
     if has_restart:
@@ -148,6 +164,11 @@ def _check_state(findings: Findings, data: Mapping[str, Any], has_restart: bool)
     if state == "BUS-OFF":
         case = "off" if has_restart else "off_slcan"
     if state != "STOPPED":  # a stopped interface is down, which was reported above
-        findings.add("can.state", case, counts=counts, state=state.lower())
+        findings.add(
+            "can.state",
+            case,
+            counts=counts,
+            state=state.lower(),
+        )
     for mode in set(_MODES) & set(data.get("ctrlmode", ())):
         findings.add("can.mode", _MODES[mode])

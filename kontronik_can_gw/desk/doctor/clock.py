@@ -25,7 +25,12 @@ def check_clock(machine: Machine, findings: Findings) -> None:
         running = {process.name for process in machine.processes}
         for name, command in _SERVICES.items():
             if name[:_COMM_LENGTH] in running:
-                findings.add("machine.clock", "waits", service=name, show=command)
+                findings.add(
+                    "machine.clock",
+                    "waits",
+                    service=name,
+                    show=command,
+                )
                 break
         else:
             findings.add("machine.clock", "no_service")

@@ -30,10 +30,6 @@ _ESCAPE = re.compile(r"\\([0-7]{3})")
 """A blank or another character in the names of /proc/self/mountinfo."""
 
 
-def _unescaped(found: re.Match[str]) -> str:
-    return chr(int(found[1], 8))
-
-
 class Process(NamedTuple):
     """A running program."""
 
@@ -114,7 +110,8 @@ class Machine:
         longest = 0
         for line in self.text("/proc/self/mountinfo").splitlines():
             fields, _, rest = line.partition(" - ")
-            place = PurePath(_ESCAPE.sub(_unescaped, fields.split(" ")[4]))
+            name = _ESCAPE.sub(lambda found: chr(int(found[1], 8)), fields.split(" ")[4])
+            place = PurePath(name)
             if real.is_relative_to(place) and len(place.parts) >= longest:  # the last one is on top
                 longest = len(place.parts)
                 found = rest.partition(" ")[0]
@@ -188,7 +185,7 @@ class Machine:
         return found
 
     @property
-    def runs_gateway(self) -> bool:
+    def has_gateway(self) -> bool:
         return any(process.is_gateway for process in self.processes)
 
     def openers(self, device: os.stat_result) -> Iterator[Process]:
@@ -196,9 +193,6 @@ class Machine:
         for process in self.processes:
             folder = f"/proc/{process.pid}/fd"
             files = (self.status(f"{folder}/{number}") for number in self.names(folder))
-            if any(_is_device(file, device) for file in files):
+            devices = [file.st_rdev for file in files if file and stat.S_ISCHR(file.st_mode)]
+            if device.st_rdev in devices:
                 yield process
-
-
-def _is_device(file: os.stat_result | None, device: os.stat_result) -> bool:
-    return file is not None and stat.S_ISCHR(file.st_mode) and file.st_rdev == device.st_rdev

@@ -19,12 +19,11 @@ _RULES = "udev/rules.d/70-kontronik-can-gw.rules"
 
 def diagnoses(document: Mapping[str, Any] | None) -> dict[str, str]:
     """Return the reasons for missing telemetry, by ESC, from a gateway's status document."""
-    escs = [] if document is None else document["escs"]
-    found = {}
-    for esc in escs:
-        if esc["diagnosis"]:
-            found[esc["name"]] = printable(str(esc["diagnosis"]))
-    return found
+    return {
+        esc["name"]: printable(str(esc["diagnosis"]))
+        for esc in (document or {"escs": ()})["escs"]
+        if esc["diagnosis"]
+    }
 
 
 def check_port(
@@ -51,27 +50,25 @@ def check_port(
     hardware = f"/sys/class/tty/{tty}"
     is_pty = real.startswith("/dev/pts/")
     if status is None or not _is_port(machine, status, hardware, is_pty):
-        case = "no_port" if status else "none"
-        findings.add("port.exists", case, there=_available(machine))
+        names = ", ".join(machine.names("/dev/serial/by-id"))
+        there = f". Available in /dev/serial/by-id: {names}" if names else ""
+        findings.add("port.exists", "no_port" if status else "none", there=there)
         return findings.found
     usb = _adapter(machine, machine.real(f"{hardware}/device"))
     product = machine.text(f"{usb}/product") if usb else ""
     what = ", ".join(filter(None, [tty, product]))
-    case = "pty" if is_pty else "ok"
-    findings.add("port.exists", case, what=what)
+    findings.add("port.exists", "pty" if is_pty else "ok", what=what)
     if diagnosis:
         findings.add("port.telemetry", "none", diagnosis=diagnosis)
-    case = _permission(machine, port, status)
     group = machine.group_name(status.st_gid)
-    findings.add("port.permission", case, group=group)
+    findings.add("port.permission", _permission(machine, port, status), group=group)
     _check_users(machine, findings, status, is_pty)
     if is_pty:
         return findings.found
     if usb:
         if port.startswith("/dev/tty"):
             better = _stable_name(machine, real, usb)
-            case = "unstable" if better else "no_udev"
-            findings.add("port.name", case, better=better)
+            findings.add("port.name", "unstable" if better else "no_udev", better=better)
         _check_probing_services(machine, findings)
     _check_consoles(machine, findings, tty)
     if even_parity and is_mini_uart(f"/dev/{tty}", machine.root):
@@ -86,19 +83,11 @@ def _is_port(machine: Machine, status: os.stat_result, hardware: str, is_pty: bo
     return is_pty or machine.exists(hardware)
 
 
-def _available(machine: Machine) -> str:
-    """Return a sentence that lists the serial adapters. Empty if there are none."""
-    names = machine.names("/dev/serial/by-id")
-    if not names:
-        return ""
-    return f". Available in /dev/serial/by-id: {', '.join(names)}"
-
-
 def _permission(machine: Machine, port: str, status: os.stat_result) -> str:
     """Return the case of the check ``port.permission``."""
     if machine.may(port, os.R_OK | os.W_OK):
         return "ok"
-    if machine.runs_gateway:
+    if machine.has_gateway:
         return "gateway"
     has_group_access = status.st_mode & 0o060 == 0o060
     if has_group_access and status.st_gid != 0:
@@ -149,7 +138,12 @@ def _check_users(
     if others:
         who = ", ".join(map(str, others))
         pids = " ".join(str(process.pid) for process in others)
-        findings.add("port.users", "others", who=who, pids=pids)
+        findings.add(
+            "port.users",
+            "others",
+            who=who,
+            pids=pids,
+        )
     if not own and not others:
         sees_all = is_pty or machine.user == "root"
         findings.add("port.users", "ok" if sees_all else "unseen")
@@ -158,15 +152,13 @@ def _check_users(
 def _check_consoles(machine: Machine, findings: Findings, tty: str) -> None:
     """Check that no console of the kernel and no login prompt writes to the ESC."""
     consoles = machine.text("/sys/class/tty/console/active").split()
-    case = "console" if tty in consoles else "ok"
-    findings.add("port.console", case)
+    findings.add("port.console", "console" if tty in consoles else "ok")
     prompts = []
     for process in machine.processes:
         arguments = [word.rpartition("/")[2] for word in process.words[1:]]
         if "getty" in process.name and tty in arguments:
             prompts.append(str(process))
-    case = "getty" if prompts else "ok"
-    findings.add("port.getty", case, who=", ".join(prompts))
+    findings.add("port.getty", "getty" if prompts else "ok", who=", ".join(prompts))
 
 
 def _check_probing_services(machine: Machine, findings: Findings) -> None:

@@ -58,7 +58,12 @@ def check_service(
         case = "none"
         if not machine.exists(_BOOTED):
             case = "not_booted" if any(map(machine.exists, units)) else "no_systemd"
-        findings.add("machine.service", case, unit=_unit_name(config), file=config)
+        findings.add(
+            "machine.service",
+            case,
+            unit=_unit_name(config),
+            file=config,
+        )
         return
     state = unit.shown.get("ActiveState", "")
     restarts = unit.shown.get("NRestarts", "0")
@@ -67,12 +72,24 @@ def check_service(
     if state not in ("active", "reloading"):
         case = "failed" if state == "failed" else "stopped"
     findings.values["unit"] = unit.name
-    findings.add("machine.service", case, result=result, state=state, restarts=restarts)
+    findings.add(
+        "machine.service",
+        case,
+        result=result,
+        state=state,
+        restarts=restarts,
+    )
     if not unit.shown.get("UnitFileState", "").startswith("enabled"):
         findings.add("machine.service_enabled", "no")
     user = unit.shown.get("User") or "root"
     if user != machine.user:
-        findings.add("machine.user", "other", user=user, me=machine.user, file=config)
+        findings.add(
+            "machine.user",
+            "other",
+            user=user,
+            me=machine.user,
+            file=config,
+        )
 
 
 def check_folder(
@@ -103,18 +120,30 @@ def check_folder(
     elif own:
         case = "by_systemd"
     elif not machine.may(str(there), os.W_OK | os.X_OK):
-        case = "gateway" if machine.runs_gateway else "closed"
+        case = "gateway" if machine.has_gateway else "closed"
     made = "" if str(there) == folder else ", will be created"
     space = {"free": free // 1_000_000, "needed": needed // 1_000_000}
     names = {"what": what, "folder": folder, "there": there, "user": machine.user}
-    findings.add("config.folder", case, made=made, **names, **space)
+    findings.add(
+        "config.folder",
+        case,
+        made=made,
+        **names,
+        **space,
+    )
 
 
 def check_file_system(machine: Machine, findings: Findings, what: str, folder: str) -> None:
     """Check that files of a folder can be replaced safely, so that a power loss is harmless."""
     kind = machine.file_system(str(_existing(machine, folder)))
     if kind in _WITHOUT_JOURNAL:
-        findings.add("config.file_system", "unsafe", what=what, folder=folder, kind=kind)
+        findings.add(
+            "config.file_system",
+            "unsafe",
+            what=what,
+            folder=folder,
+            kind=kind,
+        )
 
 
 def _existing(machine: Machine, folder: str) -> PurePath:

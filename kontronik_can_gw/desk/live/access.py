@@ -203,7 +203,12 @@ class Address(NamedTuple):
             address = cls(host, port, token, is_open)
             part = folder / f"{_FILE}.part"
             content = json.dumps(address._asdict())
-            write_new(part, content.encode(), 0o600, is_synced=True)
+            write_new(
+                part,
+                content.encode(),
+                0o600,
+                is_synced=True,
+            )
             part.replace(folder / _FILE)
         except OSError as error:
             raise RunError(

@@ -212,6 +212,9 @@ class Flights:
             kinds.remove("parquet")
         flights = []
         for recording in self._recordings.values():
+            summary = None
+            with contextlib.suppress(OSError, ValueError):
+                summary = json.loads(self._made(recording, _SUMMARY).read_text(encoding="utf-8"))
             flights.append(
                 {
                     "id": recording.id,
@@ -219,7 +222,7 @@ class Flights:
                     "size": recording.size,
                     "parts": len(recording.paths),
                     "isWritten": recording.is_written,
-                    "summary": self._summary(recording),
+                    "summary": summary,
                     "states": {kind: self._state(recording, kind) for kind in _COMMANDS},
                 }
             )
@@ -236,11 +239,6 @@ class Flights:
             return "waiting"
         if self._made(recording, kind).exists():
             return "made"
-        return None
-
-    def _summary(self, recording: Recording) -> Any:
-        with contextlib.suppress(OSError, ValueError):
-            return json.loads(self._made(recording, _SUMMARY).read_text(encoding="utf-8"))
         return None
 
     def _made(self, recording: Recording, kind: str) -> Path:

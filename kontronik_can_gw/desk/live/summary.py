@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
-from kontronik_can_gw.desk.report.flight import Flight
-from kontronik_can_gw.desk.report.recorded import flight_of
+from kontronik_can_gw.desk.report.flight import Flight, flight_of
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
 from kontronik_can_gw.times import MS, SECOND

@@ -88,20 +88,13 @@ class Esc(Member):
     @property
     def active(self) -> list[Alarm]:
         """The error bits that are set."""
-        found: list[Alarm] = []
-        for word in self.protocol.errors:
-            found += self.flags(word) or ()
-        return found
+        return [flag for word in self.protocol.errors for flag in self.flags(word) or ()]
 
     @property
     def units(self) -> dict[str, str]:
         """Unit of each source in the DBC, except flags and error words."""
-        words = self.protocol.errors
-        found = {}
-        for name, value in VALUES.items():
-            if name in self.no_flags and name not in words:
-                found[name] = value.unit
-        return found
+        names = self.no_flags.keys() - self.protocol.errors.keys()
+        return {name: value.unit for name, value in VALUES.items() if name in names}
 
     def document(self) -> dict[str, Any]:
         """Return all data as JSON. Values that are not available are None."""

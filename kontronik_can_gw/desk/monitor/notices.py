@@ -39,7 +39,7 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, NoticeKind]
         yield text, NoticeKind.REPLAY
     if source.problem:
         yield source.problem, NoticeKind.FAULT
-    elif source.ended and not monitor.view.frames:
+    elif source.has_ended and not monitor.view.frames:
         text = f"{source.name} contains no frame of {monitor.file}."
         yield f"{text} Give the DBC of its frames (-c, --dbc).", NoticeKind.FAULT
     elif monitor.is_quiet:

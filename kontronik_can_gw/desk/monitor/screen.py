@@ -3,12 +3,12 @@
 It is a table of all ESCs, or the page of one ESC with all its values. Pure.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from math import inf
 
 from rich.text import Text
 
 from kontronik_can_gw.desk.member import Alarm, alarms_of
-from kontronik_can_gw.desk.monitor.charts import MARKS, chart_heights, chart_rows, sparkline
 from kontronik_can_gw.desk.monitor.lines import (
     STATES,
     Part,
@@ -58,6 +58,59 @@ _ALARM_LINES = 6
 """Lines that a page reserves for errors and warnings."""
 _FEW_ALARM_LINES = 2
 """Lines for errors and warnings below the table of all ESCs if room is short."""
+
+
+_LEVELS = "▁▂▃▄▅▆▇█"
+MARKS = {"": "bold", "!": "bold yellow", "!!": "bold red"}
+"""Styles of marked values. The marks themselves are for displays without colour."""
+_MAX_CHART_LINES = 8
+
+
+def sparkline(esc: Esc, quantity: Quantity, width: int, height: int = 1) -> list[Text]:
+    """Return a chart of the last ``width`` seconds of a value, with the newest at the right.
+
+    It is scaled to the extremes of the value. It has ``height`` lines, the top one first.
+    """
+    track = esc.tracks[quantity.source]
+    values = list(track.history)[-width:] if width else []
+    scale = [value for value in (*values, track.low, track.high) if value is not None]
+    low = min(scale, default=0.0)
+    high = max(scale, default=0.0)
+    span = high - low
+    steps = len(_LEVELS) * height
+    made = [line() for _ in range(height)]
+    for value in values:
+        filled = 0
+        style = ""
+        if value is not None:
+            part = (value - low) / span if 0 < span < inf else 0.0
+            filled = 1 + round(part * (steps - 1))
+            mark = quantity.mark(value)
+            style = MARKS[mark] if mark else "cyan"
+        for above, each in enumerate(reversed(made)):
+            level = filled - above * len(_LEVELS)
+            character = " "
+            if level > 0:
+                character = _LEVELS[min(level, len(_LEVELS)) - 1]
+            each.append(character, style)
+    return made
+
+
+def chart_heights(count: int, height: int) -> list[int]:
+    """Distribute ``height`` lines among ``count`` charts, at least one line for each.
+
+    The first charts get one line more if lines are left.
+    """
+    each, more = divmod(height, max(1, count))
+    return [max(1, min(each + (index < more), _MAX_CHART_LINES)) for index in range(count)]
+
+
+def chart_rows(cells: Sequence[Part], chart: Sequence[Text]) -> Iterator[list[Part]]:
+    """Yield the rows of a table whose last column is a chart. The first row has the cells."""
+    blank = [""] * len(cells)
+    for index, part in enumerate(chart):
+        first = blank if index else cells
+        yield [*first, part]
 
 
 def screen(
@@ -271,7 +324,11 @@ def _histories(escs: Sequence[Esc], width: int, height: int, largest: int) -> li
     They use ``height`` lines, so that their heights do not depend on alarms. If charts of one line
     each do not fit, they use up to ``largest``. Empty without values and if they do not fit.
     """
-    known = [each for each in _HISTORIES if _has_history(each, escs)]
+    known = [
+        each
+        for each in _HISTORIES
+        if any(set(esc.tracks[each.source].history) - {None} for esc in escs)
+    ]
     chart_lines = height - 2  # without the empty line and the head
     if chart_lines < len(known) * len(escs):
         chart_lines = largest - 2
@@ -298,45 +355,29 @@ def _histories(escs: Sequence[Esc], width: int, height: int, largest: int) -> li
     return [line(), *table(rows, width, 3, least)]
 
 
-def _has_history(quantity: Quantity, escs: Sequence[Esc]) -> bool:
-    """Return True if a chart of the quantity has at least one value of an ESC."""
-    return any(set(esc.tracks[quantity.source].history) - {None} for esc in escs)
-
-
-def _is_supplied(quantity: Quantity, escs: Sequence[Esc]) -> bool:
-    return any(esc.has(quantity.source) for esc in escs)
-
-
 def table_of(escs: Sequence[Esc], width: int) -> list[Text]:
     """Return the table of all ESCs: the values in the DBC, with one speed before the others."""
-    supplied = [quantity for quantity in QUANTITIES if _is_supplied(quantity, escs)]
+    supplied = [
+        quantity for quantity in QUANTITIES if any(esc.has(quantity.source) for esc in escs)
+    ]
     speeds = [quantity for quantity in supplied if quantity.unit == "1/min"]
-    shown = speeds[:1]
-    for quantity in supplied:
-        if quantity.head and quantity not in speeds:
-            shown.append(quantity)
-    columns: list[list[Part]] = []
-    for quantity in shown:
-        head = quantity.head or quantity.unit
-        column: list[Part] = [(head, "dim")]
-        column += [_value_part(esc, quantity) for esc in escs]
-        columns.append(column)
+    shown = speeds[:1] + [each for each in supplied if each.head and each not in speeds]
     links = [_link_part(esc) for esc in escs]
     room = width - _widest(links, _LINK_WIDTH) - 2
-    for quantity, column in zip(shown, columns, strict=True):
+    columns: list[list[Part]] = []
+    for quantity in shown:
+        head: Part = (quantity.head or quantity.unit, "dim")
+        column = [head, *(_value_part(esc, quantity) for esc in escs)]
+        columns.append(column)
         if quantity in speeds or QUANTITIES.index(quantity) <= _LAST_KEPT:
             room -= _widest(column, _VALUE_WIDTH) + 1
     name_width, state_width = _name_and_state_widths(escs, room)
     names: list[Part] = [("ESC", "dim")]
-    states: list[Part] = [("state", "dim")]
-    for esc in escs:
-        names.append(_name_part(esc, name_width))
-        state = line(_state_part(esc))
+    names += [_name_part(esc, name_width) for esc in escs]
+    states = [line(("state", "dim")), *(line(_state_part(esc)) for esc in escs)]
+    for state in states:
         state.truncate(state_width, overflow="ellipsis")
-        states.append(state)
-    head_of_links: Part = ("link", "dim")
-    columns = [names, [head_of_links, *links], states, *columns]
-    rows = list(zip(*columns, strict=True))
+    rows = list(zip(names, [("link", "dim"), *links], states, *columns, strict=True))
     least = [_NAME_WIDTH, _LINK_WIDTH, state_width]
     least += [_VALUE_WIDTH] * len(shown)
     return table(rows, width, 3, least)

@@ -154,7 +154,9 @@ def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
     """
     try:
         # the file may be replaced by a pipe at any time, on which a normal open would block
-        with open(file, "rb", opener=_open_without_waiting) as opened:
+        with open(
+            file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)
+        ) as opened:
             if not stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
                 text = "is not a regular file. Check statistics.file."
                 return Seen(file, NOT_RUNNING, f"{file}: {text}")
@@ -165,7 +167,12 @@ def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
         if config is not None:
             start = f"Start it: kontronik-can-gw run -c {config}"
             text = f"{config}: no gateway runs with this configuration. {start}"
-        return Seen(file, NOT_RUNNING, text, is_missing=True)
+        return Seen(
+            file,
+            NOT_RUNNING,
+            text,
+            is_missing=True,
+        )
     except IsADirectoryError:
         text = "is not a regular file. Check statistics.file."
     except OSError as error:
@@ -183,10 +190,6 @@ def look_at(file: Path, now: int, config: Path | None = None) -> Seen:
             return seen
         text = f"is from the gateway with {printable(str(other))}, not with {config}."
     return Seen(file, NOT_RUNNING, f"{file}: {text}")
-
-
-def _open_without_waiting(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def judge(file: Path, document: Any, now: int) -> Seen:
@@ -211,45 +214,66 @@ def _judge(file: Path, document: Document, now: int) -> Seen:
         text = "not running"  # a time in the future: the machine was restarted
         if age > 0:
             text = f"has written nothing for {duration(age)} (ended, blocked, or the disk is full)"
-        return Seen(file, NOT_RUNNING, text, (), age_s, document)
+        return Seen(
+            file,
+            NOT_RUNNING,
+            text,
+            (),
+            age_s,
+            document,
+        )
     faults = tuple(map(printable, _faults(document)))
     sentence = printable(document["gateway"]["state"])
     if not faults:
-        return Seen(file, HEALTHY, sentence, (), age_s, document)
+        return Seen(
+            file,
+            HEALTHY,
+            sentence,
+            (),
+            age_s,
+            document,
+        )
     count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
-    return Seen(file, TROUBLE, f"{sentence}, {count}", faults, age_s, document)
+    return Seen(
+        file,
+        TROUBLE,
+        f"{sentence}, {count}",
+        faults,
+        age_s,
+        document,
+    )
 
 
 def _faults(document: Document) -> Iterator[str]:
     can = document["can"]
     channel = f"CAN {can['channel']}"
-    if not can["open"] or can["state"] == "down":
-        yield can["complaint"] or f"{channel} is down"
-    elif can["state"] == "bus-off":
-        yield can["complaint"] or f"{channel} is bus-off"
-    elif can["stalled"]:
-        yield can["complaint"] or f"{channel}: no frame can be sent"
-    elif can.get("slow"):  # earlier versions do not have it
-        yield can["complaint"] or f"{channel}: the bus is slow"
+    conditions = {
+        f"{channel} is down": not can["open"] or can["state"] == "down",
+        f"{channel} is bus-off": can["state"] == "bus-off",
+        f"{channel}: no frame can be sent": can["stalled"],
+        f"{channel}: the bus is slow": can.get("slow"),  # earlier versions do not have it
+    }
+    worst = next((text for text, is_present in conditions.items() if is_present), None)
+    if worst is not None:
+        yield can["complaint"] or worst
     is_quiet = document["gateway"]["state"] == "quiet"
     for esc in document["escs"]:
         port = esc["port"]
-        reason = esc["diagnosis"]
-        if is_quiet and port["open"]:
+        if esc["fresh"] or (is_quiet and port["open"]):
             continue  # a parked vehicle has no telemetry
+        reason = esc["diagnosis"] or "no telemetry"
         if not port["open"]:
             lost = port["lost_for_s"]
             since = "" if lost is None else f" for {_duration(lost)}"
             complaint = (port["complaint"] or "").removeprefix(f"{esc['name']}: ")
             reason = f"port not open{since}: {complaint or port['path']}"
-        if not esc["fresh"]:
-            yield f"{esc['name']}: {reason or 'no telemetry'}"
-    store = document["store"]
-    if store and store["last_error"]:
-        yield f"parameters cannot be stored: {store['last_error']}"
-    recording = document["recording"]
-    if recording and recording["problem"]:
-        yield f"captures: {recording['problem']}"
+        yield f"{esc['name']}: {reason}"
+    for part, key, text in (
+        ("store", "last_error", "parameters cannot be stored"),
+        ("recording", "problem", "captures"),
+    ):
+        if document[part] and document[part][key]:
+            yield f"{text}: {document[part][key]}"
 
 
 # --- lines

@@ -63,7 +63,13 @@ def _live(console: Console, source: Source, monitor: Monitor, stopped: Stopped) 
                 _look_for_quiet(source, monitor)
                 look_due = now + _LINES_S
             if now >= due:
-                lines = screen(monitor, source, console.size, page, fd is not None)
+                lines = screen(
+                    monitor,
+                    source,
+                    console.size,
+                    page,
+                    fd is not None,
+                )
                 live.update(Text("\n").join(lines), refresh=True)
                 due = max(due + REFRESH_S, now + REFRESH_S / 2)
             source.pump(monitor.take, min(due, now + 0.1))
@@ -106,7 +112,7 @@ def obey(key: str, source: Source, monitor: Monitor, page: int) -> int:
         case "a" | "\x1b":
             return 0
         case " " if source.is_file:
-            source.paused = not source.paused
+            source.is_paused = not source.is_paused
         case digit if digit.isdecimal() and int(digit) <= count:
             return int(digit)
     return page
@@ -139,9 +145,9 @@ def _keys() -> Iterator[int | None]:
 
 def _lines(source: Source, monitor: Monitor, stopped: Stopped) -> None:
     """Print notices and the table at a fixed rate, without terminal control."""
-    while not stopped() and not source.ended:
+    while not stopped() and not source.has_ended:
         due = time.monotonic() + _LINES_S
-        while time.monotonic() < due and not source.ended and not stopped():
+        while time.monotonic() < due and not source.has_ended and not stopped():
             source.pump(monitor.take, due)
         monitor.advance(source.now())
         _look_for_quiet(source, monitor)
@@ -161,7 +167,7 @@ def once(source: Source, monitor: Monitor, timeout: float, stopped: Stopped) -> 
     of this machine is quiet on this interface.
     """
     end = time.monotonic() + timeout
-    while not stopped() and not source.ended:
+    while not stopped() and not source.has_ended:
         now = time.monotonic()
         if not source.is_file and (monitor.is_complete or now >= end):
             break
@@ -209,10 +215,10 @@ def stream(
         write_until(now)
         monitor.take(frame, now)
 
-    while not stopped() and not source.ended:
+    while not stopped() and not source.has_ended:
         source.pump(take, time.monotonic() + REFRESH_S)
         write_until(source.now())
-    if source.ended:
+    if source.has_ended:
         write_until(source.now() + SECOND)
 
 

@@ -117,7 +117,13 @@ class SignalReader:
                     continue
                 part_of_page[page] = len(self.parts)
                 unpacker = Unpacker(signals)
-                part = Part(len(columns), len(signals), plan, page, unpacker)
+                part = Part(
+                    len(columns),
+                    len(signals),
+                    plan,
+                    page,
+                    unpacker,
+                )
                 self.parts.append(part)
                 columns += [_column(signal, plan, key) for signal in signals]
             multiplexers = (s for s in all_signals if s.role is Role.MULTIPLEXER)

@@ -94,16 +94,24 @@ class EscFlight:
         self._index = index
         self._events = events
         self._protocol = protocol_named(settings.protocol)
-        self._columns = _first_fields(fields, index)
-        """Index of the field of each source."""
+        self._columns: dict[str, int] = {}
+        """Index of the first field of each source."""
+        for place, field in enumerate(fields):
+            if field.esc == index:
+                self._columns.setdefault(field.source, place)
         own_fields = [fields[place] for place in self._columns.values()]
         self.computed = _values_to_compute(own_fields)
         """Values that the recording has less often than the values from which they follow."""
-        self._floats = _float_signals(fields)
+        self._floats = {
+            field.source for field in fields if field.signal and field.kind is ColumnType.FLOAT
+        }
         """Values in CAN frames that may be infinite, which means not available."""
         self._live = next((source for source in LIVE if source in self._columns), None)
         self._words = _error_columns(self._protocol, self._columns)
-        known = _known_sources(self._columns)
+        known = set(self._columns)
+        for source, parts in COMPUTED_FROM.items():
+            if known.issuperset(parts):
+                known.add(source)
         self.drawn = [source for source in DRAWN if source in known]
         self.has_errors = bool(self._words)
         self.has_power = "battery_power" in known
@@ -131,19 +139,16 @@ class EscFlight:
         self, times: Sequence[int], chunk: Sequence[Sequence[Any]]
     ) -> list[Sequence[int | float | None]]:
         """Evaluate rows that are given as columns. Return the columns to draw."""
-        columns: Columns = {}
-        for source, place in self._columns.items():
-            columns[source] = chunk[place]
+        columns: Columns = {source: chunk[place] for source, place in self._columns.items()}
         for source in columns.keys() & self._floats:
             columns[source] = _finite(columns[source])
         self._derive(columns)
-        present: Sequence[Any] = (None,) * len(times)
-        if self._live is not None:
-            present = columns[self._live]
+        nothing = (None,) * len(times)
+        present = columns.get(self._live or "", nothing)
         self._find_gaps(times, present)
         self._find_devices(times, columns)
-        states = columns.get(_state_of(columns), ())
-        for row, state in self._changes("state", states):
+        states = columns.get("operating_state", ())
+        for row, state in self._changes("state", columns.get("operating_state_raw", states)):
             self._change_state(times[row], state)
         for error_column in self._words:
             self._find_errors(times, present, columns, error_column)
@@ -210,8 +215,14 @@ class EscFlight:
             is_lost = value is None or present[row] is None
             word_value = int(value or 0) << column.shift
             for bit in column.bits:
-                is_set = word_value >> bit & 1
-                self._change_bit(times[row], column.word, bit, is_set, is_lost)
+                is_set = bool(word_value >> bit & 1)
+                self._change_bit(
+                    times[row],
+                    column.word,
+                    bit,
+                    is_set,
+                    is_lost,
+                )
 
     def _find_gaps(self, times: Sequence[int], present: Sequence[Any]) -> None:
         """Begin and end the events of lost telemetry."""
@@ -262,20 +273,32 @@ class EscFlight:
             text = state.text
             if state.phase in PHASES:
                 phase = state.phase
-        event = FlightEvent("state", self._index, now, text, phase=PHASES.index(phase))
+        event = FlightEvent(
+            "state",
+            self._index,
+            now,
+            text,
+            phase=PHASES.index(phase),
+        )
         if phase == "Fault":
             event.severity = "error"
         self._events.begin(key, event)
 
-    def _change_bit(self, now: int, word: str, bit: int, is_set: int, is_lost: bool) -> None:
+    def _change_bit(self, now: int, word: str, bit: int, is_set: bool, is_lost: bool) -> None:
         key = (self._index, word, bit)
-        was_set = key in self._set
-        if was_set and not is_set:
+        if is_set == (key in self._set):
+            return
+        if not is_set:
             self._set.remove(key)
             self._events.end(key, now, lost=is_lost)
-        if was_set or not is_set:
             return
-        event = FlightEvent("error", self._index, now, f"unknown bit {bit}", "error")
+        event = FlightEvent(
+            "error",
+            self._index,
+            now,
+            f"unknown bit {bit}",
+            "error",
+        )
         for known in self._protocol.errors[word]:
             if known != bit:
                 continue
@@ -333,7 +356,15 @@ class EscFlight:
         currents = columns.get("battery_current", nothing)
         speeds = next((columns[source] for source in SPEEDS if source in columns), nothing)
         since_ns, has_telemetry, last_power, last_speed = self._held
-        rows = zip(times, present, powers, voltages, currents, speeds, strict=True)
+        rows = zip(
+            times,
+            present,
+            powers,
+            voltages,
+            currents,
+            speeds,
+            strict=True,
+        )
         for now, live, power, voltage, current, speed in rows:
             if has_telemetry:
                 length_ns = now - since_ns
@@ -355,25 +386,6 @@ class EscFlight:
         self._held = (since_ns, has_telemetry, last_power, last_speed)
 
 
-def _first_fields(fields: Sequence[TableColumn], esc: int) -> dict[str, int]:
-    """Return the index of the first field of each source of an ESC."""
-    found: dict[str, int] = {}
-    for index, field in enumerate(fields):
-        if field.esc == esc:
-            found.setdefault(field.source, index)
-    return found
-
-
-def _known_sources(columns: Iterable[str]) -> set[str]:
-    """Return the sources in the recording, and those that can be computed from them."""
-    known = set(columns)
-    if "battery_voltage" in known:
-        known.add("mean_cell_voltage")
-        if "battery_current" in known:
-            known.add("battery_power")
-    return known
-
-
 def _error_columns(protocol: EscProtocol, columns: Container[str]) -> list[_ErrorColumn]:
     """Return the columns with errors.
 
@@ -388,15 +400,6 @@ def _error_columns(protocol: EscProtocol, columns: Container[str]) -> list[_Erro
             if bit.text in columns:
                 column = _ErrorColumn(bit.text, word, (int(bit),), int(bit))
                 found.append(column)
-    return found
-
-
-def _float_signals(fields: Iterable[TableColumn]) -> set[str]:
-    """Return the values that are floats in CAN frames."""
-    found = set()
-    for field in fields:
-        if field.signal and field.kind is ColumnType.FLOAT:
-            found.add(field.source)
     return found
 
 
@@ -435,7 +438,3 @@ def _values_to_compute(fields: Sequence[TableColumn]) -> set[str]:
         if all(period is not None and period < own for period in part_periods):
             found.add(source)
     return found
-
-
-def _state_of(columns: Columns) -> str:
-    return "operating_state_raw" if "operating_state_raw" in columns else "operating_state"

@@ -1,20 +1,22 @@
 """Evaluates a recorded flight: turns rows of values into numbers, events and points to draw.
 
-Pure functions of the rows, in one pass, with bounded memory. Values are found by name, so any
+Reads only the rows, in one pass, with bounded memory. Values are found by name, so any
 recording and any DBC can be used. Missing values are left out. If two rows are further apart than
 the timeout, there is a gap between them. Times are ns of the recording's clock.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import compress, islice, pairwise
 from operator import ne
 from typing import NamedTuple
 
 from kontronik_can_gw.desk.quantities import COUNTERS, DRAWN, MAXIMA, MINIMA
 from kontronik_can_gw.desk.recordings.fields import TableColumn, column_of
+from kontronik_can_gw.desk.recordings.inputs import Input
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, RowBlock
 from kontronik_can_gw.desk.report.esc import DEVICE, LIVE, EscFlight, Number
 from kontronik_can_gw.desk.report.events import FlightEvent, FlightEvents
+from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.esc.value_names import normalize
@@ -84,11 +86,9 @@ class Flight:
         points: int = 20_000,
         window: tuple[float | None, float | None] = (None, None),
     ) -> None:
-        low, high = window
-        self._from_ns = round((low or 0) * SECOND)
-        self._to_ns: int | None = None
-        if high is not None:
-            self._to_ns = round(high * SECOND)
+        low_s, high_s = window
+        self._from_ns = round((low_s or 0) * SECOND)
+        self._to_ns = LATEST_NS if high_s is None else round(high_s * SECOND)
         longest_timeout_ns = max(settings.timeout_ns for settings in escs)
         self._gap_ns = max(500 * MS, longest_timeout_ns + 250 * MS)
         """Two rows further apart than this have a gap between them."""
@@ -109,7 +109,7 @@ class Flight:
         self._last_ns = 0
         """Time of the last row in the recording."""
         self.rows = 0
-        self.replayed = False
+        self.is_replayed = False
         self.escs: list[EscFlight] = []
         self._drawn: list[tuple[int, str]] = []
         """ESC and source of each line."""
@@ -142,11 +142,8 @@ class Flight:
             self.origin_ns = block.times[0]
             self._last_ns = block.times[0]
         block = self._without_long_gaps(block)
-        low = self.origin_ns + self._from_ns
-        high = LATEST_NS
-        if self._to_ns is not None:
-            high = self.origin_ns + self._to_ns
-        rows = block.between(low, high)
+        high = self.origin_ns + self._to_ns
+        rows = block.between(self.origin_ns + self._from_ns, high)
         begin = 0
         for row, time_ns in enumerate(rows.times):
             if not self.rows and not row:
@@ -214,21 +211,36 @@ class Flight:
         times = rows.times
         columns = rows.columns
         if self._gateway_state is not None:
+            replay = {GatewayState.REPLAY, normalize(GatewayState.REPLAY.name)}
             states = set(columns[self._gateway_state])
-            if any(map(_is_replay, states)):
-                self.replayed = True
+            if not replay.isdisjoint(states | {normalize(str(state)) for state in states}):
+                self.is_replayed = True
         drawn: list[Sequence[Number]] = []
         for esc in self.escs:
             drawn += esc.evaluate(times, columns)
         self.points.feed(times, drawn)
 
 
-def _is_replay(state: object) -> bool:
-    """Return True for the gateway's state REPLAY, as a number or a text."""
-    replay = GatewayState.REPLAY
-    if state == replay:
-        return True
-    return normalize(str(state)) == normalize(replay.name)
+def flight_of(
+    recording: Input,
+    window: tuple[float | None, float | None] = (None, None),
+    watch: Callable[[Iterable[RowBlock]], Iterable[RowBlock]] = iter,
+) -> Flight:
+    """Return the flight after all rows of the window. All blocks pass through ``watch``.
+
+    Raises UserError if nothing can be shown.
+    """
+    chosen = needed_columns(recording.fields)
+    fields = [recording.fields[index] for index in chosen]
+    flight = Flight(recording.bus.escs, fields, window=window)
+    if not flight.has_anything:
+        raise UserError(
+            f"{recording.bus.layout.file}: has no signal that a report shows. Give another --dbc."
+        )
+    for block in watch(filter(len, recording.blocks(chosen))):
+        if not flight.evaluate(block):
+            break
+    return flight.finish()
 
 
 # --- points to draw

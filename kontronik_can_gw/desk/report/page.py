@@ -230,7 +230,7 @@ def _head(flight: Flight, source: str, provenance: Mapping[str, str], wall_ns: i
             devices = ", then ".join(esc.devices[:8])
             port = noted.rpartition(", at ")[2]
             facts[esc.name] = ", at ".join(filter(None, (devices, port)))
-    if flight.replayed:
+    if flight.is_replayed:
         facts["Replay"] = "These frames were replayed from a recording."
     known = {label.lower() for label in facts}
     facts |= {key: text for key, text in provenance.items() if key.lower() not in known}
