@@ -187,11 +187,21 @@ def make_parser(complete: Collection[str] = tuple(COMMANDS)) -> argparse.Argumen
         epilog="kontronik-can-gw COMMAND --help describes a command.",
         allow_abbrev=False,
     )
-    parser.add_argument("-V", "--version", action="version", version=f"%(prog)s {__version__}")
+    parser.add_argument(
+        "-V",
+        "--version",
+        action="version",
+        version=f"%(prog)s {__version__}",
+    )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, line in COMMANDS.items():
         text = line[0].upper() + line[1:] + "."
-        sub = commands.add_parser(name, help=line, description=text, allow_abbrev=False)
+        sub = commands.add_parser(
+            name,
+            help=line,
+            description=text,
+            allow_abbrev=False,
+        )
         if name in complete:
             _complete(sub, import_module(f"kontronik_can_gw.cli.{name}"))
     return parser
@@ -213,7 +223,12 @@ def _complete(parser: argparse.ArgumentParser, module: ModuleType) -> None:
         subs = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
         for name, (line, options) in actions.items():
             text = line[0].upper() + line[1:] + "."
-            sub = subs.add_parser(name, help=line, description=text, allow_abbrev=False)
+            sub = subs.add_parser(
+                name,
+                help=line,
+                description=text,
+                allow_abbrev=False,
+            )
             add_options(sub, options)
 
 

@@ -75,7 +75,12 @@ def write_bundle(
     else:
         unit = unit_of(machine, str(config.absolute()))
         folders = capture_folders(machine, config, unit, document)
-        add_captures(contents, folders, with_dbc=not args.without_dbc, watch=_watched)
+        add_captures(
+            contents,
+            folders,
+            with_dbc=not args.without_dbc,
+            watch=_watched,
+        )
     with writing(args.bundle, force=args.force) as out:
         write_archive(out.open(), contents, made_ns)
         out.is_whole = True

@@ -83,9 +83,7 @@ def _file_warnings(loaded: Loaded) -> Iterator[str]:
 def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
     """Yield a summary of the gateway's inputs and outputs, in lines of at most 80 columns."""
     config = loaded.config
-    found = "no warnings"
-    if shown["warnings"]:
-        found = _counted(len(shown["warnings"]), "warning")
+    found = _counted(len(shown["warnings"]), "warning") if shown["warnings"] else "no warnings"
     yield f"{shown['file']}: can be used, {found}"
     for esc, settings in zip(config.esc, loaded.escs, strict=True):
         poles = _counted(settings.pole_pairs, "pole pair")
@@ -102,14 +100,11 @@ def summary(shown: dict[str, Any], loaded: Loaded) -> Iterator[str]:
         yield f"            restarted after {can.restart_after_s:g} s in which no frame has left,"
         yield "            if root or the service's user runs the gateway"
     if config.dbc.enabled:
-        keys = sorted((each.extended, each.can_id) for each in loaded.layout.messages)
-        ids = [f"{can_id:08X}h" if extended else f"{can_id:03X}h" for extended, can_id in keys]
-        span = ""
-        if ids:
-            span = f", {ids[0]}"
-            if ids[-1] != ids[0]:
-                span += f" to {ids[-1]}"
-        yield f"  DBC       {_counted(len(ids), 'message')}{span}, layout {shown['layout']}"
+        messages = sorted(loaded.layout.messages, key=attrgetter("extended", "can_id"))
+        ends = [f"{each.can_id:0{8 if each.extended else 3}X}h" for each in messages]
+        span = " to ".join(dict.fromkeys([*ends[:1], *ends[-1:]]))
+        about = ", ".join(filter(None, [_counted(len(messages), "message"), span]))
+        yield f"  DBC       {about}, layout {shown['layout']}"
         yield f"            {shown['dbc']}"
     for profile, names in _protected(loaded.layout).items():
         yield f"  E2E       profile {profile}: {listed(names, 3)}"

@@ -7,7 +7,6 @@ from kontronik_can_gw.cli.arguments import FORCE, number_from, option
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.output import check_output, write_output
 from kontronik_can_gw.config.keys import shipped
-from kontronik_can_gw.desk.conformance.bench import slave_on_bus
 from kontronik_can_gw.desk.conformance.eds_file import read_eds
 from kontronik_can_gw.desk.conformance.run import (
     GATEWAY_DEVIATIONS,
@@ -21,6 +20,7 @@ from kontronik_can_gw.desk.conformance.run import (
     markdown_tables,
     read_deviations,
     run,
+    slave_on_bus,
 )
 from kontronik_can_gw.desk.conformance.slave import Slave
 from kontronik_can_gw.errors import UserError
@@ -77,7 +77,8 @@ by a signal
 
 def main(args: argparse.Namespace) -> int:
     if args.list:
-        _print_items()
+        for item in all_items():
+            print(f"{item.name:45}  {item.clause}: {item.stimulus}")
         return 0
     if not 1 <= args.node <= 127:
         raise UserError(f"--node {args.node}: a node-ID is a number from 1 to 127")
@@ -90,22 +91,13 @@ def main(args: argparse.Namespace) -> int:
     eds = read_eds(path, args.node)
     with slave_on_bus(args.interface, args.channel, args.node, eds, args.limit) as slave:
         results = _results(slave, items, deviations)
-    _write_reports(args, path, results)
+    if args.output is not None:
+        write_output(args.output, _report(args, path, results), force=args.force)
+    if args.junit is not None:
+        xml = junit(results, f"CANopen conformance of {path.name}")
+        write_output(args.junit, xml.decode("utf-8"), force=args.force)
     say(counts(results), args.command)
     return int(any(result.verdict is ItemVerdict.FAILED for result in results))
-
-
-def _print_items() -> None:
-    for item in all_items():
-        print(f"{item.name:45}  {item.clause}: {item.stimulus}")
-
-
-def _write_reports(args: argparse.Namespace, eds: Path, results: list[Result]) -> None:
-    if args.output is not None:
-        write_output(args.output, _report(args, eds, results), force=args.force)
-    if args.junit is not None:
-        xml = junit(results, f"CANopen conformance of {eds.name}")
-        write_output(args.junit, xml.decode("utf-8"), force=args.force)
 
 
 def _results(slave: Slave, items: list[Item], deviations: dict[str, str]) -> list[Result]:

@@ -11,6 +11,7 @@ from kontronik_can_gw.cli.arguments import FORCE, LAYOUT, LOG_CHANNEL, REMOVED_O
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.desk import OpenInput, given_layout, reading, was_ended, watched
 from kontronik_can_gw.cli.output import (
+    STOPPED,
     check_output,
     configuration_files,
     output_of,
@@ -33,9 +34,6 @@ from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.stream import name_of
 from kontronik_can_gw.errors import RunError, UserError
 
-_STOPPED = 130
-"""Exit code after a signal."""
-
 
 def _seconds_ns(text: str) -> int:
     """Return seconds as ns. A type for argparse."""
@@ -56,16 +54,16 @@ def _names(text: str) -> list[str]:
     return found
 
 
-def _form(text: str) -> str:
-    """Return a format by its name or its suffix. A type for argparse."""
-    return SUFFIXES.get(f".{text}", text)
-
-
 OPTIONS = (
     option("IN", "capture, CAN log or UART bytes, or - for standard input", dest="input"),
     option("OUT", "file to write, or - for standard output", nargs="?"),
     option("-o --output OUT", "another way to give OUT"),
-    option("--to FORMAT", ", ".join(FORMATS), choices=FORMATS, type=_form),
+    option(
+        "--to FORMAT",
+        ", ".join(FORMATS),
+        choices=FORMATS,
+        type=lambda text: SUFFIXES.get(f".{text}", text),  # also by its suffix
+    ),
     FORCE,
     option("-q --quiet", "print no summary"),
     LAYOUT,
@@ -133,7 +131,7 @@ def main(args: argparse.Namespace, opened_by: OpenInput = open_input) -> int:
         return _convert(args, form, opened_by)
     except KeyboardInterrupt:
         say("stopped: nothing was written" if args.output != "-" else "stopped", args.command)
-        return _STOPPED
+        return STOPPED
 
 
 def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
@@ -143,17 +141,23 @@ def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
             recording.select_channel(args.channel)
         conversion = _conversion(args, form, recording)
         # the rows of a pipe cannot be read again, but only text can be used without its end
-        keeps_part = recording.stream is not None and form in ON_SCREEN
+        is_part_kept = recording.stream is not None and form in ON_SCREEN
         with writing(
-            args.output, force=args.force, keeps_part=keeps_part, handles_signals=False
+            args.output, force=args.force, is_part_kept=is_part_kept, has_handler=False
         ) as out:
             name = f"{Path(args.input).name or recording.name} to {form}:"
             out.watch = partial(watched, name=name, data_on_screen=args.output == "-")
             summary = conversion(recording, out)
         if summary is None and was_ended(recording):
             raise KeyboardInterrupt
-        _report(args, form, recording, summary, time.monotonic() - begun)
-        return _STOPPED if was_ended(recording) else 0
+        _report(
+            args,
+            form,
+            recording,
+            summary,
+            time.monotonic() - begun,
+        )
+        return STOPPED if was_ended(recording) else 0
 
 
 def _report(
@@ -238,30 +242,41 @@ def _format(args: argparse.Namespace) -> str:
 
 def _check(args: argparse.Namespace, form: str) -> None:
     """Raise UserError for wrong usage that is known before anything is opened."""
-    to_screen = args.output == "-"
-    has_start = args.start is not None
-    has_end = args.end is not None
-    if to_screen and form not in ON_SCREEN:
-        raise UserError(
-            f"{form}: cannot be written to standard output. "
-            f"Give a file, or one of these formats: {', '.join(ON_SCREEN)}"
-        )
-    if args.signals and form not in TABLES:
-        raise UserError(f"--signals: is for tables ({', '.join(TABLES)}), not for {form}")
-    if args.esc is not None and form != BYTES:
-        raise UserError(
-            f"--esc: is for bin, not for {form}. Leave it out, or choose one of several ESCs with "
-            "--signals 'NAME.*'."
-        )
-    if form == BYTES and (has_start or has_end):
-        raise UserError(
-            "--from, --until: cannot be used with bin, which has no times. Leave them out."
-        )
-    if has_start and has_end and args.end < args.start:
-        raise UserError("--until: is before --from")
+    times = [time_ns for time_ns in (args.start, args.end) if time_ns is not None]
     target = Path(args.output)
-    if not to_screen and target.exists() and not target.is_file() and form not in ON_SCREEN:
-        raise UserError(f"{target}: is not a regular file, which {form} needs. Give another name.")
+    is_text = form in ON_SCREEN
+    rules = (
+        (
+            is_text or args.output != "-",
+            (
+                f"{form}: cannot be written to standard output. "
+                f"Give a file, or one of these formats: {', '.join(ON_SCREEN)}"
+            ),
+        ),
+        (
+            form in TABLES or not args.signals,
+            f"--signals: is for tables ({', '.join(TABLES)}), not for {form}",
+        ),
+        (
+            form == BYTES or args.esc is None,
+            (
+                f"--esc: is for bin, not for {form}. Leave it out, or choose one of several ESCs "
+                "with --signals 'NAME.*'."
+            ),
+        ),
+        (
+            form != BYTES or not times,
+            "--from, --until: cannot be used with bin, which has no times. Leave them out.",
+        ),
+        (times == sorted(times), "--until: is before --from"),
+        (
+            is_text or not target.exists() or target.is_file(),
+            f"{target}: is not a regular file, which {form} needs. Give another name.",
+        ),
+    )
+    for is_kept, problem in rules:
+        if not is_kept:
+            raise UserError(problem)
 
 
 def _esc(args: argparse.Namespace, recording: Input) -> int:

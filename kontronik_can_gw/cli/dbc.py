@@ -22,7 +22,12 @@ from kontronik_can_gw.desk.dbc.writer import copies_text
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
-_ESCS = number_from(1, 127, "number of ESCs", kind=int)
+_ESCS = number_from(
+    1,
+    127,
+    "number of ESCs",
+    kind=int,
+)
 OPTIONS = (
     option(
         "-c --config FILE", "write the DBC of the messages that this configuration sends", type=Path
@@ -68,7 +73,13 @@ def main(args: argparse.Namespace) -> int:
             "usual encoding of a DBC"
         )
     inputs = configuration_files(args.config, source)
-    write_output(args.output, text, inputs, force=args.force, encoding=encoding)
+    write_output(
+        args.output,
+        text,
+        inputs,
+        force=args.force,
+        encoding=encoding,
+    )
     return 0
 
 
@@ -107,7 +118,13 @@ def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> s
     else:
         ignored: list[str] = []
         plain = load_database(file, ignored)
-        layout = prepare(plain, str(file), escs, settings, fd_allowed=True)
+        layout = prepare(
+            plain,
+            str(file),
+            escs,
+            settings,
+            fd_allowed=True,
+        )
         for line in (*ignored, *layout.warnings):
             say(f"warning: {line}")
     version = re.sub(" ?layout [0-9A-F]{8}$", "", plain.version or "")

@@ -49,7 +49,12 @@ def main(args: argparse.Namespace) -> int:
         text = markdown(_TITLE, lead, tables)
     text = printable(text, keep="\n\t")
     inputs = configuration_files(args.config, args.dbc)
-    write_output(args.output, text, inputs, force=args.force)
+    write_output(
+        args.output,
+        text,
+        inputs,
+        force=args.force,
+    )
     return 0
 
 

@@ -78,7 +78,13 @@ def main(args: argparse.Namespace) -> int:
         # support needs the bundle even if there is no configuration
         config = args.config or default_config() or CONFIG_PLACES[-1]
         findings, _ = examine(machine, config)
-        return write_bundle(args, machine, config, findings, report_lines)
+        return write_bundle(
+            args,
+            machine,
+            config,
+            findings,
+            report_lines,
+        )
     config = config_file(args.config)
     findings, code = examine(machine, config)
     if args.json:
@@ -123,7 +129,12 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
         if config is not None:
             command = f"kontronik-can-gw check -c {path}"
         for problem in error.problems:
-            about.add("config", "mistake", problem=problem, command=command)
+            about.add(
+                "config",
+                "mistake",
+                problem=problem,
+                command=command,
+            )
     if config is not None:
         _folders(machine, about, config, unit)
         files = [machine.path(str(file)) for file in possible_files(path)]
@@ -138,7 +149,12 @@ def examine(machine: Machine, path: Path) -> tuple[list[Finding], int]:
     if _has_low_voltage(machine):
         rest.add("machine.power", "low")
     versions = {"python": platform.python_version(), "kernel": platform.release()}
-    rest.add("machine.versions", "ok", version=__version__, **versions)
+    rest.add(
+        "machine.versions",
+        "ok",
+        version=__version__,
+        **versions,
+    )
     found += rest.found
     if code == 0 and count(found, "error") > 0:
         code = 1
@@ -178,7 +194,14 @@ def _folders(
         if folder is not None:
             path = folder.absolute()
             own = unit is not None and path.is_relative_to(unit.state_folder)
-            check_folder(machine, findings, use, str(path), own, min_free)
+            check_folder(
+                machine,
+                findings,
+                use,
+                str(path),
+                own,
+                min_free,
+            )
     if store is not None:
         check_file_system(machine, findings, "stored parameters", str(store.absolute()))
 

@@ -17,7 +17,12 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.status import UNCONFIGURED
 
-_NODE_ID = number_from(1, 127, "node-ID", kind=lambda text: int(text, 0))
+_NODE_ID = number_from(
+    1,
+    127,
+    "node-ID",
+    kind=lambda text: int(text, 0),
+)
 OPTIONS = (
     option(
         "-c --config FILE",
@@ -65,7 +70,13 @@ def main(args: argparse.Namespace) -> int:
     if args.node_id is not None:
         text = _dcf(setup, escs, args.node_id, Path(args.output).name)
     inputs = configuration_files(path)
-    write_output(args.output, text, inputs, force=args.force, encoding="latin-1")
+    write_output(
+        args.output,
+        text,
+        inputs,
+        force=args.force,
+        encoding="latin-1",
+    )
     return 0
 
 
@@ -78,7 +89,14 @@ def _dcf(setup: CanopenSetup, escs: list[EscSettings], node_id: int, name: str) 
                 name = f"{Path(setup.eds.name).stem}_{node_id}.dcf"
             bitrate = node.settings.bitrate
             values = _active_values(node)
-            return dcf(setup.eds, node_id, bitrate, values, esc.name, name)
+            return dcf(
+                setup.eds,
+                node_id,
+                bitrate,
+                values,
+                esc.name,
+                name,
+            )
     there = [str(node.node_id) for node in nodes if node.node_id != UNCONFIGURED]
     known = f"Available: {', '.join(there)}" if there else "All nodes wait for LSS"
     raise UserError(f"--node-id {node_id}: not in the configuration. {known}.")

@@ -64,7 +64,12 @@ def main(args: argparse.Namespace) -> int:
         say("warning: CANopen nodes are not exported, only the messages of the DBC")
     try:
         inputs = configuration_files(args.config, args.dbc)
-        _write(folder, files, inputs, force=args.force)
+        _write(
+            folder,
+            files,
+            inputs,
+            force=args.force,
+        )
     except OSError as error:
         raise RunError(
             f"{error.filename or folder}: cannot be written: {error.strerror}. Give another folder."
@@ -101,7 +106,7 @@ def _write_all(folder: Path, files: dict[str, str], *, force: bool) -> None:
             outputs = []
             for name, text in files.items():
                 path = str(folder / name)
-                out = stack.enter_context(writing(path, force=force, handles_signals=False))
+                out = stack.enter_context(writing(path, force=force, has_handler=False))
                 outputs.append(out)
                 file = out.open()
                 file.write(text.encode())

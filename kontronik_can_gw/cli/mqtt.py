@@ -23,7 +23,7 @@ from kontronik_can_gw.config.keys import Config, MqttConfig
 from kontronik_can_gw.config.kinds import BROKER
 from kontronik_can_gw.desk.libraries import missing_library
 from kontronik_can_gw.desk.mqtt.messages import Publisher
-from kontronik_can_gw.desk.mqtt.topics import Topics
+from kontronik_can_gw.desk.mqtt.published import Topics
 from kontronik_can_gw.desk.sources import Bus, can_config
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.runtime.system.fault_log import FaultLog

@@ -24,6 +24,9 @@ from kontronik_can_gw.desk.recordings.stream import is_standard_input
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
 
+STOPPED = 130
+"""Exit code after a signal."""
+
 
 def check_output(output: str, inputs: Iterable[Path], *, force: bool) -> None:
     """Raise UserError if a file must not be written.
@@ -106,25 +109,25 @@ def writing(
     output: str,
     *,
     force: bool,
-    keeps_part: bool = False,
-    handles_signals: bool = True,
+    is_part_kept: bool = False,
+    has_handler: bool = True,
 ) -> Iterator[OutputFile]:
     """Open an output for writing. Raises RunError if it cannot be written.
 
-    ``force``: an existing file is replaced. ``keeps_part``: if writing fails, OUT.part stays.
-    ``handles_signals``: SIGTERM, SIGINT and SIGHUP raise KeyboardInterrupt, which is reported.
+    ``force``: an existing file is replaced. ``is_part_kept``: if writing fails, OUT.part stays.
+    ``has_handler``: SIGTERM, SIGINT and SIGHUP raise KeyboardInterrupt, which is reported.
     Without it the caller handles them.
     """
     out = OutputFile(None if output == "-" else Path(output), force=force)
-    out.keeps_part = keeps_part
+    out.is_part_kept = is_part_kept
     try:
         with ExitStack() as stack:
-            if handles_signals:
+            if has_handler:
                 stack.enter_context(stopping_on_signals(interrupt))
             stack.enter_context(out)
             yield out
     except KeyboardInterrupt:
-        if handles_signals:
+        if has_handler:
             say(stopped(output))
         raise
     except BrokenPipeError:

@@ -174,7 +174,7 @@ def _on_can(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str
         _hold(locks, can.channel, recording)
     port = open_can(can)
     count = 0
-    recording.marked = not args.unmarked
+    recording.is_marked = not args.unmarked
     try:
         for time_ns, frame, received in recording.frames():
             if received:

@@ -8,6 +8,7 @@ from kontronik_can_gw.cli.arguments import FORCE, LAYOUT, LOG_CHANNEL, number_fr
 from kontronik_can_gw.cli.common import say
 from kontronik_can_gw.cli.desk import given_layout, reading, was_ended, watched
 from kontronik_can_gw.cli.output import (
+    STOPPED,
     check_output,
     configuration_files,
     recording_files,
@@ -15,12 +16,10 @@ from kontronik_can_gw.cli.output import (
 )
 from kontronik_can_gw.desk.recordings.inputs import Input
 from kontronik_can_gw.desk.recordings.stream import name_of
+from kontronik_can_gw.desk.report.flight import flight_of
 from kontronik_can_gw.desk.report.page import render
-from kontronik_can_gw.desk.report.recorded import flight_of
 from kontronik_can_gw.errors import RunError, UserError
 
-_STOPPED = 130
-"""Exit code after a signal."""
 _SECONDS = number_from(0, 1e9)
 OPTIONS = (
     option("IN", "capture, CAN log or UART bytes, or - for standard input", dest="input"),
@@ -69,10 +68,10 @@ def main(args: argparse.Namespace) -> int:
             if args.channel is not None:
                 recording.select_channel(args.channel)
             _write_page(args, recording, inputs)
-            return _STOPPED if was_ended(recording) else 0
+            return STOPPED if was_ended(recording) else 0
     except KeyboardInterrupt:
         say("stopped: nothing was written")
-        return _STOPPED
+        return STOPPED
 
 
 def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) -> None:
@@ -102,7 +101,12 @@ def _write_page(args: argparse.Namespace, recording: Input, inputs: list[Path]) 
         wall_ns=recording.wall_ns(flight.origin_ns),
         damage=recording.damage,
     )
-    write_output(args.output, page, inputs, force=args.force)
+    write_output(
+        args.output,
+        page,
+        inputs,
+        force=args.force,
+    )
     if recording.left_out:
         damage.append(f"{source}: {recording.left_out}")
     damage += [f"{source}: {note}" for note in recording.notes]

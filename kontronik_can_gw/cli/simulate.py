@@ -165,7 +165,12 @@ def main(args: argparse.Namespace) -> int:
         start_ns = options.period_ns * index // args.esc
         escs.append(SimulatedEsc(options, args.seed + index, start_ns))
     if args.output is not None:
-        _to_files(escs, args.output, args.seconds, force=args.force)
+        _to_files(
+            escs,
+            args.output,
+            args.seconds,
+            force=args.force,
+        )
     else:
         _to_terminals(escs, args.link, args.seconds)
     return 0

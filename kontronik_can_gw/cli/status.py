@@ -49,15 +49,7 @@ EPILOG = (
 
 
 def main(args: argparse.Namespace) -> int:
-    now = time.monotonic_ns()
-    seen = _chosen(args, now) or [look_at(file, now) for file in published_files()]
-    config = default_config()
-    if not seen and config is not None:
-        try:
-            seen = [look_at_first(possible_files(config), now, config)]
-        except UserError as error:  # a running gateway was not started with this file
-            for problem in error.problems:
-                say(f"warning: {problem}", "status")
+    seen = _seen(args, time.monotonic_ns())
     if args.json:
         print(printable_json({"gateways": [each.as_json() for each in seen]}))
     if not seen:
@@ -82,10 +74,18 @@ def main(args: argparse.Namespace) -> int:
     return code
 
 
-def _chosen(args: argparse.Namespace, now: int) -> list[Seen]:
-    """Return the gateway that the options name, or an empty list without them."""
+def _seen(args: argparse.Namespace, now: int) -> list[Seen]:
+    """Return the gateway that the options name, or all, or the one of the configuration here."""
     if args.file:
         return [look_at(args.file, now)]
     if args.config:
         return [look_at_first(possible_files(args.config), now, args.config)]
-    return []
+    seen = [look_at(file, now) for file in published_files()]
+    config = default_config()
+    if not seen and config is not None:
+        try:
+            return [look_at_first(possible_files(config), now, config)]
+        except UserError as error:  # a running gateway was not started with this file
+            for problem in error.problems:
+                say(f"warning: {problem}", "status")
+    return seen
