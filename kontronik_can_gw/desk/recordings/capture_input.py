@@ -7,6 +7,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -117,13 +118,11 @@ class CaptureInput(PlayedInput):
 
     @property
     def clock_steps(self) -> Sequence[ClockStep]:
-        steps = []
-        offset = self._begun[1]
-        for time_ns, after in self._offsets:
-            if abs(after - offset) > _STEP_NS:
-                steps.append(ClockStep(time_ns, after - offset))
-            offset = after
-        return steps
+        return [
+            ClockStep(time_ns, after - before)
+            for (_, before), (time_ns, after) in pairwise([self._begun, *self._offsets])
+            if abs(after - before) > _STEP_NS
+        ]
 
     @property
     def notes(self) -> list[str]:
@@ -131,13 +130,10 @@ class CaptureInput(PlayedInput):
 
     @property
     def channel(self) -> str:
-        try:
-            configuration = tomllib.loads(self.setup.configuration)
-            channel = str(configuration["can"]["channel"])
-        except (ValueError, LookupError, TypeError, RecursionError):
-            return "can0"
-        if re.fullmatch(r"[\w.:@/-]{1,64}", channel, re.ASCII):
-            return channel
+        with suppress(ValueError, LookupError, TypeError, RecursionError):
+            channel = str(tomllib.loads(self.setup.configuration)["can"]["channel"])
+            if re.fullmatch(r"[\w.:@/-]{1,64}", channel, re.ASCII):
+                return channel
         return "can0"
 
     def close(self) -> None:
