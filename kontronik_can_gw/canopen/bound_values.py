@@ -4,21 +4,20 @@ This is the only module of CANopen that compiles. Packers of values are shared b
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from fractions import Fraction
 from functools import lru_cache, partial
 from typing import Any
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Value, Variable
-from kontronik_can_gw.canopen.eds import FLOATS, SIGNED, TYPE_BITS, EdsEntry, range_of
+from kontronik_can_gw.canopen.eds import FLOATS, TYPE_BITS, EdsEntry, range_of
 from kontronik_can_gw.canopen.objects import LINK, Bound, bindings_of
 from kontronik_can_gw.core.slots import SlotPlan
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group, Kind
 from kontronik_can_gw.esc.values import Value as EscValue
 from kontronik_can_gw.signals.packer import compile_pack, place
-from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.signals.plan import MessagePlan, Piece, SignalPlan
 from kontronik_can_gw.status import GatewayStatus
 
 _LAST_VALUE = 1
@@ -82,7 +81,7 @@ def _read(
     if value is not None and low <= value <= high:
         return value
     if behaviour == _CODES:
-        return high if low == 0 else low
+        return low or high
     raise SdoAbort(reason)
 
 
@@ -123,13 +122,7 @@ def _stored(variable: Variable) -> EscValue:
         except SdoAbort:
             return None
 
-    return EscValue(
-        variable.entry.name,
-        "",
-        Group.GATEWAY,
-        Kind.OBJECT,
-        read=read,
-    )
+    return EscValue(variable.entry.name, "", Group.GATEWAY, Kind.OBJECT, read=read)
 
 
 def message_plan(
@@ -148,12 +141,7 @@ def message_plan(
     return MessagePlan(
         name=name,
         can_id=cob_id,
-        extended=False,
-        fd=False,
         length=(at_bit + 7) // 8,
-        send_type=SendType.EVENT,
-        cycle_ns=0,
-        delay_ns=0,
         compiled=tuple(signals),
         escs=frozenset({0}),
         paces=frozenset(source.pace or source.group for source in sources),
@@ -164,35 +152,19 @@ def _signal_plan(variable: Variable, at_bit: int) -> SignalPlan:
     entry = variable.entry
     bound = variable.bound
     length = bits_of(variable)
-    signed = entry.data_type in SIGNED
-    if bound is None:
-        source = _stored(variable)
-        slope = Fraction(1)
-    else:
-        source = bound.source
-        slope = bound.slope
-    if signed:
-        sign_bit = 1 << length - 1
-        low = -sign_bit
-        high = sign_bit - 1
-        not_available = sign_bit
-    else:
-        low = 0
-        high = (1 << length) - 1
-        not_available = high
+    low, high = range_of(entry.data_type)
+    source = _stored(variable) if bound is None else bound.source
     return SignalPlan(
         name=entry.name,
-        unit="",
-        role=Role.SOURCE,
         length=length,
-        signed=signed,
+        signed=low < 0,
         is_float=entry.data_type in FLOATS,
         pieces=(Piece(0, length, at_bit),),
         low=low,
         high=high,
-        not_available=not_available,
-        error=not_available,
-        slope=slope,
+        not_available=low or high,
+        error=low or high,
+        slope=Fraction(1) if bound is None else bound.slope,
         source=source,
         esc=None if source.group is Group.GATEWAY else 0,
     )
@@ -221,13 +193,11 @@ def _compile(mapped: Sequence[Variable]) -> SlotPlan:
         triggers |= _EVENT_OF_PACE[pace]
     if status:
         triggers |= Event.LIVE | Event.LINK | Event.INFO
-    pack_watched = compile_pack(replace(plan, compiled=tuple(status))) if status else None
     return SlotPlan(
         message=plan,
         pack=compile_pack(plan),
         triggers=triggers,
         watched=sum(place(signal.pieces, -1) for signal in status),
-        pack_watched=pack_watched,
         needs_live=is_live and not carries_link,
         only_python=only_python,
     )

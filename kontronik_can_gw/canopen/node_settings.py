@@ -79,36 +79,6 @@ def configured_settings(base: EscSettings) -> dict[int, int]:
     return {sub: given for sub, given in configured.items() if given != standard[sub]}
 
 
-def make_dictionary(
-    eds: Eds,
-    base: EscSettings,
-    settings: NodeSettings,
-    stored: Stored,
-) -> Dictionary:
-    """Return the dictionary of a node before its first reset.
-
-    Values of the configuration are power-on values, and stored values are current values. The EDS
-    has the defaults of settings that the configuration does not change.
-    """
-    dictionary = Dictionary(eds)
-    power_on = {}
-    for sub, given in configured_settings(base).items():
-        power_on[at.SETTINGS, sub] = given
-    if settings.vendor_id is not None:
-        power_on[0x1018, 1] = settings.vendor_id
-    power_on[0x1018, 4] = settings.serial
-    for (index, sub), given in power_on.items():
-        variable = dictionary.get(index, sub)
-        if variable is not None:
-            variable.power_on = given
-    startup = dictionary.get(0x1F80)
-    if startup is not None and settings.self_start:
-        startup.power_on = int(startup.power_on) & ~_SELF_START_OFF
-    dictionary.read_only = settings.read_only
-    dictionary.reset(APPLICATION, settings.node_id, stored.application)
-    return dictionary
-
-
 @dataclass(frozen=True)
 class NodeSetup:
     """Everything from which one node is made."""
@@ -122,6 +92,23 @@ class NodeSetup:
     def dictionary(self, esc: EscSettings) -> Dictionary:
         """Return the dictionary of the node before its first reset.
 
-        ``esc`` are the ESC's settings, from which 2100h is made.
+        ``esc`` are the ESC's settings, from which 2100h is made. Values of the configuration are
+        power-on values, and stored values are current values. The EDS has the defaults of settings
+        that the configuration does not change.
         """
-        return make_dictionary(self.eds, esc, self.settings, self.stored)
+        settings = self.settings
+        dictionary = Dictionary(self.eds)
+        power_on = {(at.SETTINGS, sub): given for sub, given in configured_settings(esc).items()}
+        if settings.vendor_id is not None:
+            power_on[0x1018, 1] = settings.vendor_id
+        power_on[0x1018, 4] = settings.serial
+        for (index, sub), given in power_on.items():
+            variable = dictionary.get(index, sub)
+            if variable is not None:
+                variable.power_on = given
+        startup = dictionary.get(0x1F80)
+        if startup is not None and settings.self_start:
+            startup.power_on = int(startup.power_on) & ~_SELF_START_OFF
+        dictionary.read_only = settings.read_only
+        dictionary.reset(APPLICATION, settings.node_id, self.stored.application)
+        return dictionary

@@ -467,7 +467,6 @@ def traffic(nodes: Sequence[Node], is_worst: bool) -> tuple[float, float]:
         if period_ms:
             rates.append((_HEARTBEAT_BYTES, 1000 / period_ms))
         for tpdo in node.tpdos:
-            rate = tpdo.worst_rate_hz if is_worst else tpdo.rate_hz
-            rates.append((_PDO_BYTES, rate))
+            rates.append((_PDO_BYTES, tpdo.rate_hz(is_worst)))
     frames = sum(rate for _, rate in rates)
     return frames, sum(classic_bits(size) * rate for size, rate in rates)

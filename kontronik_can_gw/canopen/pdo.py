@@ -93,20 +93,12 @@ class Tpdo:
         """True if the PDO is sent when a status object changes."""
         return self._plan is not None and self._plan.watched != 0
 
-    @property
-    def rate_hz(self) -> float:
-        """Usual frames per second with the UART at 100 Hz and SYNC at 10 Hz.
+    def rate_hz(self, is_worst: bool) -> float:
+        """Return the usual frames per second with the UART at 100 Hz and SYNC at 10 Hz.
 
-        Frames caused by changes of a status object are not counted.
+        Frames caused by changes of a status object are counted only with ``is_worst``, which means
+        that these objects change all the time.
         """
-        return self._rate_hz(is_worst=False)
-
-    @property
-    def worst_rate_hz(self) -> float:
-        """Frames per second if the status objects that cause the PDO change all the time."""
-        return self._rate_hz(is_worst=True)
-
-    def _rate_hz(self, is_worst: bool) -> float:
         if self._plan is None or not self.valid:
             return 0.0
         if self.type not in EVENT_TYPES:

@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import tomllib
 from collections.abc import Iterator
-from operator import attrgetter
+from operator import attrgetter, methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.native.load import make_core
 from kontronik_can_gw.printable import printable_json
 from kontronik_can_gw.runtime.status.statistics import NOT_OURS, has_other_content
-from kontronik_can_gw.signals.plan import MessageLayout
+from kontronik_can_gw.signals.plan import MessageLayout, MessagePlan
 from kontronik_can_gw.status import UNCONFIGURED
 
 _EXAMPLE_PORT = "_EXAMPLE-"
@@ -164,9 +164,9 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
     layout = loaded.layout
     can = config.can
     load = layout.bus_load(can.bitrate, can.data_bitrate)
-    frames = sum(map(attrgetter("rate_hz"), layout.messages))
+    frames = sum(map(MessagePlan.rate_hz, layout.messages))
     worst = layout.bus_load(can.bitrate, can.data_bitrate, is_worst=True)
-    worst_frames = sum(map(attrgetter("worst_rate_hz"), layout.messages))
+    worst_frames = sum(map(methodcaller("rate_hz", is_worst=True), layout.messages))
     for output in loaded.outputs:
         more, bits = output.traffic()
         load += bits / can.bitrate

@@ -40,11 +40,9 @@ class SlotPlan:
     pack: Pack
     triggers: int
     """The events (bits of telemetry.Event) that cause it."""
-    watched: int
+    watched: int = 0
     """If it is not 0, an event causes the slot only if it changes one of these bits."""
-    pack_watched: Pack | None
-    """Packs only the bits of ``watched``."""
-    needs_live: bool
+    needs_live: bool = False
     """It is not sent while telemetry is lost."""
     only_python: str = ""
     """The part of it that a core in C cannot express, or an empty string."""
@@ -203,10 +201,10 @@ class PythonSlot:
         settings = self._settings
         if settings is None or self.place in self._owner.pending:
             return
-        pack = settings.plan.pack_watched
+        plan = settings.plan
         # A deferred frame is sent in any case, so nothing is compared then.
-        if pack is not None and self._deferred_until == NEVER:
-            watched = pack(self._escs, self._owner.status, now, 0, 0)
+        if plan.watched and self._deferred_until == NEVER:
+            watched = plan.pack(self._escs, self._owner.status, now, 0, 0) & plan.watched
             if watched == self._last_watched:
                 return
             self._last_watched = watched

@@ -20,7 +20,7 @@ from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
 from kontronik_can_gw.esc.values import Group, Value, steps_of, values_of, with_direction
 from kontronik_can_gw.frames import FIRST_PART, PARTS
 from kontronik_can_gw.signals.packer import compile_pack, place
-from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SendType, SignalPlan
+from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 from kontronik_can_gw.times import SECOND
 
 SPEEDS = {"motor": "motor_speed", "output": "output_speed", "electrical": "electrical_speed"}
@@ -158,11 +158,7 @@ def _slot_plan(
         name="transfer",
         can_id=0,
         extended=True,
-        fd=False,
         length=length,
-        send_type=SendType.EVENT,
-        cycle_ns=0,
-        delay_ns=0,
         compiled=signals,
         escs=frozenset({0}),
         paces=frozenset({Group.LIVE}),
@@ -171,9 +167,6 @@ def _slot_plan(
         message=plan,
         pack=compile_pack(plan),
         triggers=Event.LIVE,
-        watched=0,
-        pack_watched=None,
-        needs_live=False,
         seed=kind.seed,
         is_paced=True,
     )

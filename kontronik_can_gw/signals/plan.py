@@ -71,8 +71,6 @@ class SignalPlan:
     """
 
     name: str
-    unit: str
-    role: Role
     length: int
     signed: bool
     is_float: bool
@@ -85,6 +83,8 @@ class SignalPlan:
     """Code that is sent while the value is not available."""
     error: int
     """Code that is sent if the value does not fit."""
+    unit: str = ""
+    role: Role = Role.SOURCE
     slope: Fraction = Fraction(1)
     intercept: Fraction = Fraction(0)
     source: Value | None = None
@@ -127,20 +127,20 @@ class MessagePlan:
 
     name: str
     can_id: int
-    extended: bool
-    fd: bool
     length: int
-    send_type: SendType
-    cycle_ns: int
-    """Period of a cyclic message. 0: not cyclic."""
-    delay_ns: int
-    """Minimum time between two frames. 0: no minimum."""
     compiled: tuple[SignalPlan, ...]
     """Signals of this message. For a copy, the signals of the original message."""
     escs: frozenset[int]
     """Indices of the ESCs whose values the message contains."""
     paces: frozenset[Group]
     """Groups whose data changes the message's values."""
+    extended: bool = False
+    fd: bool = False
+    send_type: SendType = SendType.EVENT
+    cycle_ns: int = 0
+    """Period of a cyclic message. 0: not cyclic."""
+    delay_ns: int = 0
+    """Minimum time between two frames. 0: no minimum."""
     pages: tuple[int | None, ...] = (None,)
     """Values of the multiplexer, one frame for each. None: without a multiplexer."""
     e2e: Protection | None = None
@@ -197,20 +197,13 @@ class MessagePlan:
         crc = 33 if self.length > 16 else 28  # with its fixed stuff bits
         return nominal, data + data // 4 + crc
 
-    @property
-    def rate_hz(self) -> float:
-        """Usual frames per second with EXPECTED_LIVE_HZ at every UART.
+    def rate_hz(self, is_worst: bool = False) -> float:
+        """Return the usual frames per second with EXPECTED_LIVE_HZ at every UART.
 
-        Frames that are sent because a value changed are not counted.
+        Frames that are sent because a value changed are counted only with ``is_worst``, which means
+        that every value that is sent on change changes all the time.
         """
-        return self._rate_hz(SendType.EVENT)
-
-    @property
-    def worst_rate_hz(self) -> float:
-        """Frames per second if every value that is sent on change changes all the time."""
-        return self._rate_hz(SendType.EVENT | SendType.ON_CHANGE)
-
-    def _rate_hz(self, counted: SendType) -> float:
+        counted = SendType.EVENT | SendType.ON_CHANGE if is_worst else SendType.EVENT
         rate = 0.0
         if counted & self.send_type:
             if Group.LIVE in self.paces:
@@ -268,14 +261,12 @@ class MessageLayout:
     ) -> float:
         """Return the share of the bus that the messages need at these rates in bit/s.
 
-        1 is the whole bus. The result can be greater. ``is_worst``: with ``worst_rate_hz`` instead
-        of ``rate_hz``.
+        1 is the whole bus. The result can be greater. ``is_worst`` as in ``MessagePlan.rate_hz``.
         """
         load = 0.0
         for message in self.messages:
             nominal, at_data_rate = message.bits
-            rate_hz = message.worst_rate_hz if is_worst else message.rate_hz
-            load += rate_hz * (nominal / bitrate + at_data_rate / data_bitrate)
+            load += message.rate_hz(is_worst) * (nominal / bitrate + at_data_rate / data_bitrate)
         return load
 
 

@@ -51,8 +51,6 @@ from kontronik_can_gw.signals.plan import (
     MessageLayout,
     MessagePlan,
     Piece,
-    Role,
-    SendType,
     SignalPlan,
 )
 from kontronik_can_gw.status import GatewayStatus
@@ -296,8 +294,6 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
         codes = (0x7E00, 0x7BFF) if is_float else (0, high)
         signal = SignalPlan(
             source.name,
-            "",
-            Role.SOURCE,
             length,
             signed,
             is_float,
@@ -316,15 +312,11 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
     plan = MessagePlan(
         "transfer",
         0,
-        True,
-        False,
         (at + 7) // 8,
-        SendType.EVENT,
-        0,
-        0,
         tuple(signals),
         frozenset({0}),
         frozenset({Group.LIVE}),
+        extended=True,
     )
     seed = chance.randrange(1 << 16)
     paced = chance.random() < 0.7
@@ -332,12 +324,8 @@ def transfer_plan(chance: random.Random) -> SlotPlan:
         plan,
         compile_pack(plan),
         Event.LIVE,
-        0,
-        None,
-        False,
-        "",
-        seed,
-        paced,
+        seed=seed,
+        is_paced=paced,
     )
     try:
         slot_rows(found, EscSettings().protocol)
