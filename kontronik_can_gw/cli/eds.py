@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 
 from kontronik_can_gw.canopen import objects as at
-from kontronik_can_gw.canopen.dcf import dcf
 from kontronik_can_gw.canopen.dictionary import SdoAbort, Value
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.objects import BINDINGS
@@ -13,6 +12,7 @@ from kontronik_can_gw.canopen.storage import VERIFY
 from kontronik_can_gw.cli.arguments import OUTPUT, number_from, option
 from kontronik_can_gw.cli.common import announced_config, canopen_of, load_all
 from kontronik_can_gw.cli.output import configuration_files, write_output
+from kontronik_can_gw.desk.dcf import dcf
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.status import UNCONFIGURED

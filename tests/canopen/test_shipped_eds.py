@@ -13,11 +13,11 @@ from canopen.objectdictionary import ODVariable
 from eds_text import SHIPPED as SHIPPED_TEXT
 from eds_text import dcfchk, with_key
 
-from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.eds import Eds, EdsEntry
+from kontronik_can_gw.canopen.eds import Eds, EdsEntry, without
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import EscConfig
+from kontronik_can_gw.desk import dcf
 from kontronik_can_gw.esc.kontronik.fields import DataType, FieldRow, InfoData, LiveData, rows
 
 pytestmark = pytest.mark.promise("shipped-eds")
@@ -168,7 +168,7 @@ def test_canopen_library_reads_every_entry_like_our_reader(shipped: Eds, node_id
 
 def test_mirrors_can_be_dropped(shipped: Eds, tmp_path: Path) -> None:
     mirrors = (0x603F, 0x606C, 0x6079)
-    shorter = dcf.without(DATA, mirrors)
+    shorter = without(DATA, mirrors)
     rest = reader.load(shorter, "short.eds")
     assert rest.entries == tuple(entry for entry in shipped.entries if entry.index not in mirrors)
     file = tmp_path / "mine.eds"

@@ -19,10 +19,10 @@ from eds_text import SHIPPED, variable, with_key
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kontronik_can_gw.canopen import dcf
 from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.check import check_eds
-from kontronik_can_gw.canopen.eds import EdsEntry
+from kontronik_can_gw.canopen.eds import EdsEntry, without
+from kontronik_can_gw.desk import dcf
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings
 
@@ -135,7 +135,7 @@ def test_damaged_file_is_either_read_or_refused(data: st.DataObject) -> None:
 
 def test_cob_ids_of_one_node_and_of_missing_objects_are_checked() -> None:
     text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x40000080")
-    (said,) = problems(dcf.without(text.encode(), {0x1014}), 1)
+    (said,) = problems(without(text.encode(), {0x1014}), 1)
     assert "COB-ID 081h is used by 1014h:00 of node 1 and by 1800h:01 of node 1." in said
     text = with_key(SHIPPED, "1800sub1", "DefaultValue", "$NODEID+0x4000057F")
     assert problems(text, 1) == ()
@@ -273,7 +273,7 @@ def behaviour(dropped: frozenset[int], self_start: bool = False) -> list[str]:
 
     SDO is not used, because it would show which objects exist.
     """
-    eds = changed_eds(reader.load(dcf.without(DATA, dropped), "my.eds"), EVERY_SYNC)
+    eds = changed_eds(reader.load(without(DATA, dropped), "my.eds"), EVERY_SYNC)
     check_eds(eds, shipped_eds(), [EscSettings()])
     bench = Bench(eds=eds, boot=False, self_start=self_start)
     bench.can_state("ERROR_ACTIVE")
@@ -382,7 +382,7 @@ def test_dcf_of_a_file_with_other_letters_is_ascii() -> None:
     )
     assert text.isascii()
     assert "ParameterName=Akkuspannung grosser 5deg" in text
-    assert problems(dcf.without(data, {0x606C})) == ()
+    assert problems(without(data, {0x606C})) == ()
 
 
 @pytest.mark.parametrize("coding", ["latin-1", "utf-8-sig", "utf-16"])
