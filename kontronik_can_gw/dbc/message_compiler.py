@@ -36,26 +36,24 @@ _TABLE = Path(__file__).with_name("send_types.tsv")
 def compile_message(job: Compilation, copy: Copy) -> MessagePlan | None:
     """Return the plan of a message. None if it cannot be sent, with lines in ``job.problems``."""
     message = copy.message
-    where = f"{job.file}: {message.name}"
     before = len(job.problems)
-    job.problems += _frame_problems(job, message, where)
-    if _is_empty(message) or message.length > FD_LENGTHS[-1]:
-        return None
-    send_type, cycle_ns, delay_ns = _timing(job, message, where)
+    job.problems += _frame_problems(job, message)
+    send_type, cycle_ns, delay_ns = _timing(job, message)
     numbers: set[int] = set()
     for signal in message.signals:
         numbers.update(signal.multiplexer_ids or ())
     pages = sorted(numbers)
-    problem = _too_many_pages(message, len(pages))
+    problem = _unsupported(message, len(pages))
     if problem:
-        job.problems.append(f"{where}: {problem}")
+        job.problems.append(f"{message.name}: {problem}")
+    if problem or message.length > FD_LENGTHS[-1]:
         return None
     known = len(job.problems)
     stated = stated_protection(job, copy)
     is_unclear = stated is None and len(job.problems) > known
     signals = _signals(job, copy, stated)
-    job.problems += _placement_problems(message, where)
-    job.problems += _page_problems(message, pages, signals, where)
+    job.problems += _placement_problems(message)
+    job.problems += _page_problems(message, pages, signals)
     protection = None if is_unclear else message_protection(job, copy, signals, stated)
     if len(job.problems) > before:
         return None
@@ -80,32 +78,26 @@ def _is_fd(message: "Message") -> bool:
     return message.is_fd or message.length > 8
 
 
-def _is_empty(message: "Message") -> bool:
-    return message.is_container or message.length == 0 or not message.signals
-
-
-def _frame_problems(
-    job: Compilation,
-    message: "Message",
-    where: str,
-) -> Iterator[str]:
+def _frame_problems(job: Compilation, message: "Message") -> Iterator[str]:
     if _is_fd(message) and not job.fd_allowed:
         yield (
-            f"{where}: is a CAN FD message ({message.length} bytes). "
+            f"{message.name}: is a CAN FD message ({message.length} bytes). "
             "Set can.fd = true, or shorten it."
         )
     if _is_fd(message) and message.length not in FD_LENGTHS:
         lengths = ", ".join(map(str, FD_LENGTHS[9:]))
-        yield f"{where}: CAN FD has no frames of {message.length} bytes. Use one of {lengths}."
-    if _is_empty(message):
         yield (
-            f"{where}: has no signals to send. "
-            "Add signals, or exclude the message with dbc.messages."
+            f"{message.name}: CAN FD has no frames of {message.length} bytes. Use one of {lengths}."
         )
 
 
-def _too_many_pages(message: "Message", count: int) -> str | None:
-    """Return the problem of a message whose multiplexing is not supported. None if it is."""
+def _unsupported(message: "Message", count: int) -> str | None:
+    """Return the problem of a message that cannot be compiled, or None.
+
+    It has no signals, or its multiplexing with ``count`` values is not supported.
+    """
+    if message.is_container or message.length == 0 or not message.signals:
+        return "has no signals to send. Add signals, or exclude the message with dbc.messages."
     multiplexers = [signal for signal in message.signals if signal.is_multiplexer]
     if len(multiplexers) > 1 or any(signal.multiplexer_ids for signal in multiplexers):
         return (
@@ -134,21 +126,20 @@ def _signals(job: Compilation, copy: Copy, protection: Protection | None) -> lis
     return plans
 
 
-def _placement_problems(message: "Message", where: str) -> Iterator[str]:
+def _placement_problems(message: "Message") -> Iterator[str]:
     """Yield the first error of cantools about a signal outside the message, or an overlap."""
     from cantools.database.errors import Error
 
     try:
         message.refresh(strict=True)
     except Error as error:
-        yield f"{where}: {error} Move or shorten it."
+        yield f"{message.name}: {error} Move or shorten it."
 
 
 def _page_problems(
     message: "Message",
     pages: Sequence[int],
     signals: Sequence[SignalPlan],
-    where: str,
 ) -> Iterator[str]:
     """Yield problems of multiplexer values that do not fit, and of multiplexed protection."""
     for multiplexer in message.signals:
@@ -160,11 +151,11 @@ def _page_problems(
                         f"cannot represent the multiplexer value {page} (m{page}), at most "
                         f"{largest}. Make it longer, or change the value."
                     )
-                    yield f"{where}.{multiplexer.name}: {problem}"
+                    yield f"{message.name}.{multiplexer.name}: {problem}"
     for signal in signals:
         if signal.page is not None and signal.role in (Role.ALIVE, Role.CRC):
             yield (
-                f"{where}.{signal.name}: is a multiplexed {signal.role.value}, "
+                f"{message.name}.{signal.name}: is a multiplexed {signal.role.value}, "
                 "but must be in every frame. "
                 f"Remove its m{signal.page}, or bind it to a constant."
             )
@@ -180,23 +171,19 @@ def _meanings() -> dict[str, str]:
     return found
 
 
-def _timing(
-    job: Compilation,
-    message: "Message",
-    where: str,
-) -> tuple[SendType, int, int]:
+def _timing(job: Compilation, message: "Message") -> tuple[SendType, int, int]:
     """Return send type, cycle time and minimum delay time in ns."""
     cycle = 0
     # the last two are for messages that are sent only in an active state; here they always are
     for attribute_name in ("GenMsgCycleTime", "GenMsgCycleTimeFast", "GenMsgCycleTimeActive"):
-        cycle = cycle or _time(job, message, attribute_name, where)
-    delay = _time(job, message, "GenMsgDelayTime", where)
+        cycle = cycle or _time(job, message, attribute_name)
+    delay = _time(job, message, "GenMsgDelayTime")
     text = str(attribute(message, "GenMsgSendType", job.database) or "")
     job.send_types.add(text)
     name = job.settings.send_type.get(text, _meanings().get(normalize(text)))
     if name is None:
         job.problems.append(
-            f"{where}: unknown GenMsgSendType {text!r}. "
+            f"{message.name}: unknown GenMsgSendType {text!r}. "
             f"Set dbc.send_type.{text!r} to its meaning: {', '.join(SEND_TYPES)}."
         )
         return SendType.EVENT, cycle, delay
@@ -206,18 +193,13 @@ def _timing(
     send_type = SEND_TYPES[name]
     if SendType.CYCLIC in send_type and not cycle:
         job.problems.append(
-            f"{where}: is sent {text}, but its GenMsgCycleTime is 0. "
+            f"{message.name}: is sent {text}, but its GenMsgCycleTime is 0. "
             f'Set a time in ms, or dbc.send_type.{text!r} = "Event".'
         )
     return send_type, cycle, delay
 
 
-def _time(
-    job: Compilation,
-    message: "Message",
-    name: str,
-    where: str,
-) -> int:
+def _time(job: Compilation, message: "Message", name: str) -> int:
     """Return an attribute in ms as exact ns. 0 if it is not set.
 
     Adds a line to the problems for a value that is not a time, and a warning for a time below 1 ms.
@@ -231,10 +213,12 @@ def _time(
             raise ValueError
     except (ValueError, OverflowError, ZeroDivisionError):
         job.problems.append(
-            f"{where}: {name} is {str(value)[:40]!r}, which is not a time in ms. Correct it."
+            f"{message.name}: {name} is {str(value)[:40]!r}, which is not a time in ms. Correct it."
         )
         return 0
     if 0 < found < MS:
-        job.warnings.append(f"{where}: {name} is {value} ms. The shortest time is used, 1 ms.")
+        job.warnings.append(
+            f"{message.name}: {name} is {value} ms. The shortest time is used, 1 ms."
+        )
         return MS
     return found

@@ -56,26 +56,26 @@ def prepare(
     example the CANopen nodes with their COB-IDs. Raises UserError with all mistakes together.
     """
     node = choose_node(database, settings.node, file, settings.messages)
-    left_out = own_left_out(database, node, file, settings.messages)
     copies = copies_of(database, file, escs, settings)
     ours = [copy for copy in copies if node in copy.message.senders]
-    job = Compilation(database, file, settings, Binder(escs, settings.bind), fd_allowed)
-    job.problems += left_out
+    job = Compilation(database, settings, Binder(escs, settings.bind), fd_allowed)
+    job.problems += own_left_out(database, node, file, settings.messages)
     plans = [*_compiled(job, ours)]
-    job.problems += _clashes(copies, node, taken_ids or {}, file)
-    job.problems += _unused_settings(job, ours, node)
+    job.problems += _clashes(copies, node, taken_ids or {})
     if len(job.unbound) > _MANY:
         job.problems.append(
-            f"{file}: {len(job.unbound)} signals of {node} have no source. "
+            f"{len(job.unbound)} signals of {node} have no source. "
             "Choose the messages to send with dbc.messages, for example "
             f'["{ours[0].message.name}", "Esc*"], '
             'or send such signals as constants with dbc.unbound = "start_value".'
         )
-    if job.problems:
-        raise UserError(*dict.fromkeys(job.problems))
-    job.warnings += shared_data_ids(file, plans)
-    job.warnings += _timing_warnings(job, plans)
-    warnings = dict.fromkeys(job.warnings)
+    problems = [f"{file}: {problem}" for problem in dict.fromkeys(job.problems)]
+    problems += _unused_settings(job, ours, node, file)
+    if problems:
+        raise UserError(*problems)
+    job.warnings += shared_data_ids(plans)
+    job.warnings += _timing_warnings(plans)
+    warnings = [f"{file}: {warning}" for warning in dict.fromkeys(job.warnings)]
     return MessageLayout(file, node, tuple(plans), tuple(warnings))
 
 
@@ -113,7 +113,6 @@ def _clashes(
     copies: Sequence[Copy],
     node: str,
     taken: Mapping[int, str],
-    file: str,
 ) -> Iterator[str]:
     """Yield the problems of ids and names that are used twice, and of ids that are taken.
 
@@ -127,21 +126,21 @@ def _clashes(
         senders = copy.message.senders
         if same_id is not copy and node in (*senders, *same_id.message.senders):
             yield (
-                f"{file}: {copy.name}: id {copy.frame_id:X}h is already used by {same_id.name}. "
+                f"{copy.name}: id {copy.frame_id:X}h is already used by {same_id.name}. "
                 "Change one of them."
             )
         if same_name is not copy and node in (*senders, *same_name.message.senders):
-            yield f"{file}: {copy.name}: two messages have this name. Rename one of them."
+            yield f"{copy.name}: two messages have this name. Rename one of them."
         if node not in senders:
             continue
         counted = Counter(signal.name for signal in copy.message.signals)
         for name, count in counted.items():
             if count > 1:
-                yield f"{file}: {copy.message.name}.{name}: two signals have this name. Rename one."
+                yield f"{copy.message.name}.{name}: two signals have this name. Rename one."
         user = copy.key if copy.key in taken else block_of(copy.key, taken)
         if user is not None:
             yield (
-                f"{file}: {copy.name}: id {copy.frame_id:X}h is used by {taken[user]}. "
+                f"{copy.name}: id {copy.frame_id:X}h is used by {taken[user]}. "
                 f"Move the message (always free: 680h..6DFh) or change the node-ID."
             )
 
@@ -150,10 +149,10 @@ def _unused_settings(
     job: Compilation,
     ours: Sequence[Copy],
     node: str,
+    file: str,
 ) -> Iterator[str]:
     """Yield the problems of settings that do not apply to any of the gateway's messages."""
     settings = job.settings
-    file = job.file
     messages = [copy.message for copy in ours]
     known = [message.name for message in messages]
     for message in messages:
@@ -186,11 +185,11 @@ def _unmet(
         yield f"dbc.{table}.{text}: no {condition} in {file}.{near}"
 
 
-def _timing_warnings(job: Compilation, plans: Sequence[MessagePlan]) -> Iterator[str]:
+def _timing_warnings(plans: Sequence[MessagePlan]) -> Iterator[str]:
     once = [plan.name for plan in plans if not plan.cycle_ns and not plan.paces]
     if once:
         yield (
-            f"{job.file}: sent only once, at the start, without a cycle time or a changing value: "
+            f"sent only once, at the start, without a cycle time or a changing value: "
             f"{listed(once)}"
         )
 

@@ -14,10 +14,10 @@ from kontronik_can_gw.dbc import e2e_attributes
 from kontronik_can_gw.dbc.copies import Copy
 from kontronik_can_gw.dbc.e2e_attributes import UnclearAttribute
 from kontronik_can_gw.dbc.names import is_e2e
-from kontronik_can_gw.dbc.reader import listed
+from kontronik_can_gw.dbc.reader import is_matched, listed
 from kontronik_can_gw.dbc.signal_compiler import Compilation
 from kontronik_can_gw.signals.e2e import DATA_IDS, PROFILES, DataIdMode, Profile, Protection
-from kontronik_can_gw.signals.plan import MessagePlan, Role, SignalPlan
+from kontronik_can_gw.signals.plan import MessagePlan, Piece, Role, SignalPlan
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -32,7 +32,6 @@ def stated_protection(job: Compilation, copy: Copy) -> Protection | None:
     Adds a line to ``job.problems`` for a statement that is unclear or incomplete. A protection
     without its data ID is returned nevertheless, so that the message's signals can be checked.
     """
-    where = f"{job.file}: {copy.message.name}"
     try:
         profile, is_of_dbc = stated_profile(job.settings, job.database, copy)
         if profile is None:
@@ -40,26 +39,22 @@ def stated_protection(job: Compilation, copy: Copy) -> Protection | None:
         data_ids = stated_data_ids(job.settings, job.database, copy, profile)
     except UnclearAttribute as error:
         job.problems.append(
-            f"{where}: {error} Name the profile: {_profile_key(copy)}, "
+            f"{copy.message.name}: {error} Name the profile: {_profile_key(copy)}, "
             "or leave the message out (dbc.messages)."
         )
         job.protected.update(keys_of(copy, tuple(job.settings.e2e)))
         return None
     if is_of_dbc:
-        job.problems += _length_problems(job, copy, where)
-    job.problems += _data_id_problems(copy, profile, data_ids, where)
+        job.problems += _length_problems(job, copy)
+    job.problems += _data_id_problems(copy, profile, data_ids)
     return Protection(profile, data_ids or (0,))
 
 
 def keys_of(copy: Copy, patterns: Sequence[str]) -> list[str]:
     """Return the keys of [dbc.e2e] that apply to a message, the most specific one first."""
-    named = [name for name in (copy.name, copy.message.name) if name in patterns]
-    matching = [
-        pattern
-        for pattern in patterns
-        if fnmatch.fnmatchcase(copy.name, pattern)
-        or fnmatch.fnmatchcase(copy.message.name, pattern)
-    ]
+    both = (copy.name, copy.message.name)
+    named = [name for name in both if name in patterns]
+    matching = [pattern for pattern in patterns if fnmatch.filter(both, pattern)]
     return list(dict.fromkeys([*named, *matching]))
 
 
@@ -123,7 +118,7 @@ def remove_later_data_ids(database: "Database", settings: DbcConfig) -> None:
     0.5.0 used only the attributes that a rule defines, and only of messages with a profile.
     """
     for message in database.messages:
-        has_profile = any(fnmatch.fnmatchcase(message.name, each) for each in settings.e2e)
+        has_profile = is_matched(message.name, settings.e2e)
         with contextlib.suppress(UnclearAttribute):
             has_profile = has_profile or e2e_attributes.profile_of(message, database) is not None
         e2e_attributes.remove_data_ids(message, only_likely=has_profile)
@@ -149,7 +144,6 @@ def _data_id_warnings(
     """
     if copy.name in job.settings.e2e_data_ids:
         return
-    where = f"{job.file}: {copy.message.name}"
     name = "E2EDataId"
     try:
         stated = e2e_attributes.data_ids_of(copy.message, job.database)
@@ -167,7 +161,7 @@ def _data_id_warnings(
     if stated == sent.data_ids:
         if name != "E2EDataId" and not has_warned:
             yield (
-                f"{where}: sent with the data ID of the attribute {name}, {text[:80]}. "
+                f"{copy.message.name}: sent with the data ID of the attribute {name}, {text[:80]}. "
                 f"To confirm this, set {key} = {value}"
             )
         return
@@ -175,13 +169,14 @@ def _data_id_warnings(
     if copy.prefix:
         reason = "each ESC's copy of the message needs its own"
     yield (
-        f"{where}: {copy.name} is sent with the data ID {value}, not with the {name} of the DBC, "
-        f"{text[:80]}, because {reason}. Receivers must expect {value}: to confirm or change it, "
+        f"{copy.message.name}: {copy.name} is sent with the data ID {value}, not with the "
+        f"{name} of the DBC, {text[:80]}, because {reason}. Receivers must expect {value}: to "
+        "confirm or change it, "
         f"set {key} = {value}"
     )
 
 
-def shared_data_ids(file: str, plans: Sequence[MessagePlan]) -> Iterator[str]:
+def shared_data_ids(plans: Sequence[MessagePlan]) -> Iterator[str]:
     """Yield a warning for each data ID of several messages, which receivers cannot tell apart."""
     users: dict[tuple[int, ...], list[str]] = {}
     for plan in plans:
@@ -191,37 +186,39 @@ def shared_data_ids(file: str, plans: Sequence[MessagePlan]) -> Iterator[str]:
         if len(names) > 1:
             shown = ", ".join(f"0x{data_id:X}" for data_id in data_ids)
             yield (
-                f"{file}: {listed(names)} have the same data ID, {shown}, so a receiver does not "
+                f"{listed(names)} have the same data ID, {shown}, so a receiver does not "
                 "notice if one is received instead of another. Give each its own: "
                 f"dbc.e2e_data_ids.{names[-1]}"
             )
 
 
-def _data_id_problems(
-    copy: Copy, profile: Profile, data_ids: Sequence[int], where: str
-) -> Iterator[str]:
+def _data_id_problems(copy: Copy, profile: Profile, data_ids: Sequence[int]) -> Iterator[str]:
     key = f"dbc.e2e_data_ids.{copy.name}"
     example = f"{key} = [1, 2, …]" if profile.ids > 1 else f"{key} = 0x123"
     needed = f"{DATA_IDS} data IDs, one for each counter" if profile.ids > 1 else "one data ID"
     if len(data_ids) != profile.ids:
         found = f"has {len(data_ids)}" if data_ids else "has none"
-        yield f"{where}: E2E profile {profile.name} needs {needed}; it {found}. Set {example}."
+        yield (
+            f"{copy.message.name}: E2E profile {profile.name} needs {needed}; it {found}. Set "
+            f"{example}."
+        )
         return
     for data_id in data_ids:
         if data_id > profile.largest_id:
             yield (
-                f"{where}: the data ID 0x{data_id:X} is too large for E2E profile {profile.name}, "
-                f"at most 0x{profile.largest_id:X}. Set {example}."
+                f"{copy.message.name}: the data ID 0x{data_id:X} is too large for E2E profile "
+                f"{profile.name}, at most 0x{profile.largest_id:X}. Set {example}."
             )
             return
 
 
-def _length_problems(job: Compilation, copy: Copy, where: str) -> Iterator[str]:
+def _length_problems(job: Compilation, copy: Copy) -> Iterator[str]:
     bits = e2e_attributes.protected_bits_of(copy.message, job.database)
     if bits not in (None, copy.message.length * 8):
         yield (
-            f"{where}: E2EDataLength is {bits} bits of {copy.message.length * 8}. Only a message "
-            f"that is protected as a whole can be sent. To confirm this, set {_profile_key(copy)}."
+            f"{copy.message.name}: E2EDataLength is {bits} bits of {copy.message.length * 8}. "
+            "Only a message that is protected as a whole can be sent. To confirm this, set "
+            f"{_profile_key(copy)}."
         )
 
 
@@ -236,17 +233,16 @@ def message_protection(
     Adds lines to ``job.problems`` if its signals do not fit, and a warning if the profile is
     assumed because of the signals' names.
     """
-    where = f"{job.file}: {copy.message.name}"
     crcs = [signal for signal in signals if signal.role is Role.CRC]
     alive = [signal for signal in signals if signal.role is Role.ALIVE]
     if len(crcs) > 1:
         names = ", ".join(signal.name for signal in crcs)
         job.problems.append(
-            f"{where}: has several CRC signals: {names}. Bind all but one to constants."
+            f"{copy.message.name}: has several CRC signals: {names}. Bind all but one to constants."
         )
     if not crcs and stated is not None and not _is_replaced(job, copy):
         job.problems.append(
-            f"{where}: its E2EProfile needs a CRC, but no signal is known to be one. "
+            f"{copy.message.name}: its E2EProfile needs a CRC, but no signal is known to be one. "
             'Bind it: dbc.bind.SIGNAL = "crc".'
         )
     if len(crcs) != 1:
@@ -259,21 +255,23 @@ def message_protection(
         found = _assumed(job, copy, crc, alive)
     if found is None:
         job.problems.append(
-            f"{where}.{crc.name}: the DBC does not define how this checksum is computed. "
-            f"Name its AUTOSAR E2E profile ({', '.join(PROFILES)}): {_profile_key(copy, '2')}. "
+            f"{copy.message.name}.{crc.name}: the DBC does not define how this checksum is "
+            f"computed. Name its AUTOSAR E2E profile ({', '.join(PROFILES)}): "
+            f"{_profile_key(copy, '2')}. "
             f"Profile 1A is also chosen by {_data_id_key(copy, copy.frame_id & 0xFFFF)}. "
             "Otherwise bind it to a constant, if receivers take "
             "one, or leave the message out (dbc.messages)."
         )
         return None
-    job.problems += _fit_problems(found.profile, crc, alive, signals, where)
+    job.problems += _fit_problems(copy, found.profile, crc, alive, signals)
     has_warned = len(job.warnings) > warnings_before
     job.warnings += _data_id_warnings(job, copy, found, has_warned=has_warned)
     length = copy.message.length
     if length > found.profile.max_bytes:
         job.warnings.append(
-            f"{where}: has {length} bytes, but AUTOSAR allows at most {found.profile.max_bytes} "
-            f"for E2E profile {found.profile.name}, so its receivers may refuse it. "
+            f"{copy.message.name}: has {length} bytes, but AUTOSAR allows at most "
+            f"{found.profile.max_bytes} for E2E profile {found.profile.name}, so its "
+            "receivers may refuse it. "
             "Shorten it, or use profile 5 (up to 4096 bytes)"
         )
     return found
@@ -304,66 +302,64 @@ def _assumed(
     protection = Protection(_DEFAULT, data_ids)
     if job.binder.bound(copy, own) is not None:
         return protection
-    if len(alive) != 1 or [*_fit_problems(_DEFAULT, crc, alive, (), "")]:
+    if len(alive) != 1 or [*_fit_problems(copy, _DEFAULT, crc, alive, ())]:
         return None
     counter = alive[0].name.removeprefix(copy.prefix)
     if not is_e2e(own, str(job.binder.bound(copy, counter) or counter)):
         return None
-    where = f"{job.file}: {copy.message.name}"
     stated = e2e_attributes.unprotected(copy.message, job.database)
     although = "" if stated is None else f", although its E2EProfile is {stated!r}"
     job.warnings.append(
-        f"{where}.{crc.name}: sent as AUTOSAR E2E profile 1{although}. To confirm this, set "
-        f"{_data_id_key(copy, data_ids[0])}"
+        f"{copy.message.name}.{crc.name}: sent as AUTOSAR E2E profile 1{although}. To confirm "
+        f"this, set {_data_id_key(copy, data_ids[0])}"
     )
     return protection
 
 
 def _fit_problems(
+    copy: Copy,
     profile: Profile,
     crc: SignalPlan,
     alive: Sequence[SignalPlan],
     signals: Sequence[SignalPlan],
-    where: str,
 ) -> Iterator[str]:
     """Yield the problems of signals that do not fit the profile."""
     title = f"E2E profile {profile.name}"
     at = crc.pieces[0].at
-    is_whole = len(crc.pieces) == 1 and crc.length == profile.crc_bits and at % 8 == 0
-    if not is_whole:
-        order = "" if profile.crc_bits == 8 else ", the low byte first"
+    if at % 8 or crc.pieces != (Piece(0, profile.crc_bits, at),):
+        order = ", the low byte first" if profile.crc_bits > 8 else ""
         yield (
-            f"{where}.{crc.name}: an {title} CRC needs {profile.crc_bits} bits on a byte "
-            f"border{order}."
+            f"{copy.message.name}.{crc.name}: an {title} CRC needs {profile.crc_bits} bits on "
+            f"a byte border{order}."
         )
         return
-    if profile.crc_byte is not None and at != profile.crc_byte * 8:
+    if profile.crc_byte not in (None, at // 8):
         yield (
-            f"{where}.{crc.name}: an {title} CRC is in byte {profile.crc_byte}, not in byte "
-            f"{at // 8}. Profile 22 allows any byte."
+            f"{copy.message.name}.{crc.name}: an {title} CRC is in byte {profile.crc_byte}, "
+            f"not in byte {at // 8}. Profile 22 allows any byte."
         )
     most = profile.counters - 1
     if len(alive) != 1 or alive[0].high < most:
         yield (
-            f"{where}: {crc.name}: {title} needs exactly one alive counter, 0 to {most}, "
-            "in the message."
+            f"{copy.message.name}: {crc.name}: {title} needs exactly one alive counter, 0 to "
+            f"{most}, in the message."
         )
     elif profile.counter_bits is not None:
-        (counter,) = alive
-        (piece, *others) = counter.pieces
-        wanted = at + profile.crc_bits
-        if others or counter.length != profile.counter_bits or piece.at != wanted:
-            last = profile.counter_bits - 1
+        wanted = Piece(0, profile.counter_bits, at + profile.crc_bits)
+        if alive[0].pieces != (wanted,):
             yield (
-                f"{where}.{counter.name}: an {title} counter is in bits 0 to {last} of the byte "
-                f"after the CRC, here byte {wanted // 8}."
+                f"{copy.message.name}.{alive[0].name}: an {title} counter is in bits 0 to "
+                f"{wanted.width - 1} of the byte after the CRC, here byte {wanted.at // 8}."
             )
     nibbles = [signal for signal in signals if signal.role is Role.DATA_ID]
-    if profile.mode is DataIdMode.NIBBLE and len(nibbles) != 1:
+    if len(nibbles) != (profile.mode is DataIdMode.NIBBLE):
         yield (
-            f"{where}: {title} sends 4 bits of the data ID, but no signal is known to contain "
+            f"{copy.message.name}: {title} sends 4 bits of the data ID, but no signal is "
+            "known to contain "
             'them. Bind it: dbc.bind.SIGNAL = "data_id".'
         )
     for nibble in nibbles:
-        if nibble.length != 4 or nibble.page is not None or nibble.is_float:
-            yield f"{where}.{nibble.name}: has to be 4 bits of every frame, for {title}."
+        if (nibble.length, nibble.page, nibble.is_float) != (4, None, False):
+            yield (
+                f"{copy.message.name}.{nibble.name}: has to be 4 bits of every frame, for {title}."
+            )

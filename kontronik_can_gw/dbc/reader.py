@@ -135,35 +135,29 @@ def parse_database(
     _refuse_other_formats(text, path)
     check_bounds(text, path)
     with without_asammdf():
-        import cantools.database
+        from cantools.database.can import Database
 
     logging.getLogger("cantools").addHandler(logging.NullHandler())  # _equal_messages reports them
     rewriting = _Rewriting(text, path)
+    database = Database(strict=False, sort_signals=None)
     try:
-        database = cantools.database.load_string(
-            rewriting.result,
-            database_format="dbc",
-            strict=False,
-            sort_signals=None,
-        )
+        database.add_dbc_string(rewriting.result)
     except Exception as error:  # cantools raises errors of many types for other text than a DBC
         raise UserError(f"{path}: {_reason(error)}") from None
-    if not isinstance(database, cantools.database.Database):
-        raise UserError(f"{path}: is not a CAN database")
     if not database.messages and not rewriting.left_out:
         raise UserError(f"{path}: has no messages. Is it a DBC?")
     _LEFT_OUT[database] = rewriting.left_out
     if warnings is not None:
         for reason, entries in rewriting.ignored.items():
             warnings.append(f"{path}: ignored entries {reason}: {listed(entries)}")
-        texts = [f"{each.name} ({each.sender}) {each.reason}" for each in rewriting.left_out]
-        if texts:
+        if rewriting.left_out:
+            texts = map("{0.name} ({0.sender}) {0.reason}".format, rewriting.left_out)
             warnings.append(f"{path}: left out messages that cannot be sent: {listed(texts)}")
         warnings += (f"{path}: {text}" for text in _equal_messages(database))
     return database
 
 
-_SYNTAX = re.compile(r'(?:DBC: ")?Invalid syntax at (line \d+, column \d+): "([A-Z_]*)')
+_SYNTAX = re.compile(r'Invalid syntax at (line \d+, column \d+): "([A-Z_]*)')
 """An error of cantools: its place, and the keyword at the beginning of the line."""
 
 
@@ -172,7 +166,7 @@ def _reason(error: Exception) -> str:
     text = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
     found = _SYNTAX.match(text)
     if found is None:
-        return f"cannot be read as a DBC: {text.removeprefix('DBC: ')}"
+        return f"cannot be read as a DBC: {text}"
     where, keyword = found.groups()
     # the rest of the line is not shown, because it may hold a secret, and a support bundle has this
     entry = f", in the entry {keyword}" if keyword else ""
@@ -212,11 +206,10 @@ def own_left_out(
     """
     problems = []
     for name, sender, reason in _LEFT_OUT.get(database, ()):
-        is_chosen = any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns or "*")
-        if sender == node and is_chosen:
-            problems.append(f"{file}: {name}: {reason}. Correct it.")
+        if sender == node and is_matched(name, patterns or "*"):
+            problems.append(f"{name}: {reason}. Correct it.")
     if problems and not any(node in message.senders for message in database.messages):
-        raise UserError(*problems)
+        raise UserError(*(f"{file}: {problem}" for problem in problems))
     return problems
 
 
@@ -374,6 +367,11 @@ class _Rewriting:
         return _TEXT_VALUE.sub(rewritten, text)
 
 
+def is_matched(name: str, patterns: Iterable[str]) -> bool:
+    """Return True if a message's name matches one of these patterns of a configuration."""
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+
 def listed(names: Iterable[str], limit: int = 6) -> str:
     """Return the first ``limit`` names, each once, and the number of further names."""
     names = list(dict.fromkeys(names))
@@ -396,32 +394,26 @@ def choose_node(
     """
     if wanted is None and patterns and not any(each.senders for each in database.messages):
         for message in database.messages:
-            if any(fnmatch.fnmatchcase(message.name, pattern) for pattern in patterns):
+            if is_matched(message.name, patterns):
                 message.senders.append(NO_NODE)
         return NO_NODE
-    found = {each.sender for each in _LEFT_OUT.get(database, ())} - {NO_NODE}
-    for message in database.messages:
-        found.update(message.senders)
-    senders = sorted(found)
+    senders = {each.sender for each in _LEFT_OUT.get(database, ())} - {NO_NODE}
+    senders.update(*(message.senders for message in database.messages))
+    text = ", ".join(sorted(senders))
+    node = wanted or (text if len(senders) == 1 else "KontronikGateway")
+    if node in senders:
+        return node
     if wanted is not None:
-        if wanted in senders:
-            return wanted
         raise UserError(
             f"{file}: node {wanted!r} sends no messages. "
-            f"Nodes that send messages: {', '.join(senders) or 'none'}."
+            f"Nodes that send messages: {text or 'none'}."
         )
     if not senders:
         raise UserError(
             f"{file}: no message has a transmitter, so none is sent. "
             "Choose messages with dbc.messages, or name a transmitter in the DBC (BU_ and BO_)."
         )
-    if len(senders) == 1:
-        return senders[0]
-    if "KontronikGateway" in senders:
-        return "KontronikGateway"
-    raise UserError(
-        f"{file}: several nodes send messages: {', '.join(senders)}. Set dbc.node to the gateway's."
-    )
+    raise UserError(f"{file}: several nodes send messages: {text}. Set dbc.node to the gateway's.")
 
 
 def attribute(owner: Any, name: str, database: "Database") -> Any:

@@ -35,12 +35,12 @@ class Compilation:
     """A DBC, its settings, and the results of its compilation."""
 
     database: "Database"
-    file: str
     settings: DbcConfig
     binder: Binder
     fd_allowed: bool
     problems: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    """They begin with the name of the message, and get the file's name later."""
     units: set[str] = field(default_factory=set)
     """Unit texts of the gateway's signals."""
     send_types: set[str] = field(default_factory=set)
@@ -64,8 +64,10 @@ class SignalCompiler:
         self.job = job
         self.copy = copy
         self.signal = signal
-        self.protection = protection
-        """The stated E2E protection of the signal's message."""
+        self.nibble: int | None = None
+        """The bits of the data ID that the message contains, by the stated E2E protection."""
+        if protection is not None and protection.profile.mode is DataIdMode.NIBBLE:
+            self.nibble = protection.nibble
         self.table = ValueTable(signal)
         self.start = attribute(signal, "GenSigStartValue", job.database)
         self.start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
@@ -85,7 +87,7 @@ class SignalCompiler:
 
     @property
     def _where(self) -> str:
-        return f"{self.job.file}: {self.copy.message.name}.{self.signal.name}"
+        return f"{self.copy.message.name}.{self.signal.name}"
 
     def _check(self) -> None:
         """Raise UnfitSignal for a length or a value table that cannot be sent."""
@@ -232,24 +234,20 @@ class SignalCompiler:
         found = None if role else self.job.binder.by_name(name, self.copy.esc)
         if found is not None:
             return self._bound(plan, *found)
-        if self._is_data_id(name):
-            assert self.protection is not None
-            return replace(plan, role=Role.DATA_ID, constant=self.protection.nibble)
+        if self.nibble is not None and names.is_data_id(name):
+            return replace(plan, role=Role.DATA_ID, constant=self.nibble)
         role = role or names.protection(name)
-        if role is not None:
-            if role is Role.ALIVE:
-                plan = _counted(plan, self.table)
-            can_count = not plan.is_float and plan.low <= 0 and plan.high >= 2
-            if role is Role.ALIVE and not can_count:
+        if role is Role.ALIVE:
+            plan = _counted(plan, self.table)
+            if plan.is_float or plan.low > 0 or plan.high < 2:
                 raise UnfitSignal(
                     "an alive counter must be an integer of at least 2 bits with a minimum of 0. "
                     "Otherwise bind it to a constant."
                 )
+        if role is not None:
             return replace(plan, role=role)
         if bound is None and self.job.settings.unbound == "start_value":
             return replace(plan, constant=self._start_value(plan), unbound=True)
-        if bound is None:
-            self.job.unbound.add(self._where)
         raise UnfitSignal(self._without_meaning(name, bound is not None))
 
     def _without_meaning(self, name: str, is_bound: bool) -> str:
@@ -258,6 +256,7 @@ class SignalCompiler:
         if is_bound:
             hints = self.job.binder.suggestions(name)
             return f'no such source (bound by dbc.bind to "{name}").{hints} Correct {key}.'
+        self.job.unbound.add(self._where)
         if names.is_data_id(name) and self.signal.length == 4:
             return (
                 "is the name of 4 bits of an E2E data ID, which only the profiles 1C and 11C send. "
@@ -273,12 +272,6 @@ class SignalCompiler:
             )
         hints = self.job.binder.suggestions(name)
         return f"no such source.{hints} Bind it under [dbc.bind] or rename it."
-
-    def _is_data_id(self, name: str) -> bool:
-        """Return True if the signal contains a part of the data ID of an E2E profile."""
-        if self.protection is None or self.protection.profile.mode is not DataIdMode.NIBBLE:
-            return False
-        return names.is_data_id(name)
 
     def _bound(
         self,
