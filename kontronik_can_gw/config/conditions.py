@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Any, NamedTuple
 
-from kontronik_can_gw.config.kinds import TEXT, KeyKind, shown
+from kontronik_can_gw.config.kinds import TEXT, KeyKind, list_of, shown
 from kontronik_can_gw.errors import did_you_mean
 from kontronik_can_gw.esc.decoder import Severity
 from kontronik_can_gw.esc.protocols import PROTOCOLS
@@ -90,27 +90,18 @@ def _limit(text: str, rest: str, value: Value) -> float:
     return float(number)
 
 
-def _check_conditions(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list):
-        raise ValueError(f"{shown(value)} is not a list of conditions such as [{_EXAMPLE}]")
-    _check_each(value, lambda text: condition(TEXT.check(text)))
-    return tuple(value)
-
-
-def _check_each(values: list[Any], check: Callable[[Any], object]) -> None:
-    """Check all entries of a list. Raises ValueError with the mistakes of all entries."""
-    problems = []
-    for value in values:
-        try:
-            check(value)
-        except ValueError as error:
-            problems.append(str(error))
-    if problems:
-        raise ValueError("; ".join(problems).replace("?; ", "? "))
+def _check_condition(value: Any) -> str:
+    text: str = TEXT.check(value)
+    condition(text)
+    return text
 
 
 _TEXT = {"type": "string", "pattern": r"^[^<>=!]*[<>]=?\s*[-+]?[0-9].*$"}
-CONDITIONS = KeyKind("list of conditions", {"type": "array", "items": _TEXT}, _check_conditions)
+CONDITIONS = list_of(
+    KeyKind("condition", _TEXT, _check_condition),
+    "list of conditions",
+    f"conditions such as [{_EXAMPLE}]",
+)
 
 
 def _error_names() -> list[str]:
@@ -122,25 +113,19 @@ def _error_names() -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _check_error(value: Any) -> None:
-    text = TEXT.check(value)
+def _check_error(value: Any) -> str:
+    text: str = TEXT.check(value)
     names = _error_names()
     if text not in names:
         near = did_you_mean(text, names).replace(" Did", ". Did")
         raise ValueError(
             f"{shown(text)} is neither error, warning or status nor an error bit{near}"
         )
+    return text
 
 
-def _check_errors(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list):
-        raise ValueError(f'{shown(value)} is not a list such as ["error", "undervoltage"]')
-    _check_each(value, _check_error)
-    return tuple(value)
-
-
-ERRORS = KeyKind(
+ERRORS = list_of(
+    KeyKind("error", {"type": "string", "enum": _error_names()}, _check_error),
     "list of error, warning, status and error bits",
-    {"type": "array", "items": {"type": "string", "enum": _error_names()}},
-    _check_errors,
+    'names such as ["error", "undervoltage"]',
 )

@@ -73,7 +73,7 @@ class CanConfig:
     fd: bool = key(BOOLEAN, False, "allow CAN FD, that is messages of more than 8 bytes")
     data_bitrate: int = key(integer(10_000, 8_000_000, "bit/s"), 2_000_000,
         "bit rate of CAN FD's data phase in bit/s")
-    restart_after_s: float = key(number(0.3, 3600, "s", or_zero=True), 0.0,
+    restart_after_s: float = key(number(0.3, 3600, "s", also=0), 0.0,
         "restart a SocketCAN interface from which no frame has left for this time in seconds, "
         "which discards old frames. It needs the unit kontronik-can-gw-restart@.path. "
         "0 never restarts it")

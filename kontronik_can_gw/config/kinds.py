@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
 from fractions import Fraction
+from functools import partial
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.errors import did_you_mean
@@ -113,23 +114,24 @@ def _plain(span: str, problem: str = "", limits: str = "", **schema: Any) -> Key
     return KeyKind(span, schema, check)
 
 
-def integer(low: int, high: int, unit: str = "", also: int | None = None) -> KeyKind:
-    """Accept a whole number from ``low`` to ``high``, or the greater number ``also``."""
-    schema: dict[str, Any] = {
-        "type": "integer",
-        "minimum": low,
-        "maximum": high,
-    }
+def number(
+    low: float, high: float, unit: str = "", also: float | None = None, name: str = "number"
+) -> KeyKind:
+    """Accept a number of a JSON type from ``low`` to ``high``, or the other number ``also``."""
     span = f"{low} … {high} {unit}".rstrip()
     limits = f"{low} to {high} {unit}".rstrip()
     problem = f"is outside {limits}"
+    schema: dict[str, Any] = {"type": name, "minimum": low, "maximum": high}
     if also is not None:
-        schema["maximum"] = also
-        schema["not"] = {"exclusiveMinimum": high, "exclusiveMaximum": also}
+        schema |= {"minimum": min(low, also), "maximum": max(high, also)}
+        schema["not"] = {"exclusiveMinimum": min(high, also), "exclusiveMaximum": max(low, also)}
         span = f"{span}, {also}"
         problem = f"is neither {limits} nor {also}"
         limits = f"{limits} or {also}"
     return _plain(span, problem, limits, **schema)
+
+
+integer = partial(number, name="integer")
 
 
 def integer_or_list(low: int, high: int, length: int) -> KeyKind:
@@ -138,8 +140,8 @@ def integer_or_list(low: int, high: int, length: int) -> KeyKind:
 
     def check(value: Any) -> int | tuple[int, ...]:
         if not isinstance(value, list):
-            number: int = one.check(value)
-            return number
+            found: int = one.check(value)
+            return found
         if len(value) != length:
             raise ValueError(f"{shown(value)} is not a list of {length} numbers")
         return tuple(one.check(entry) for entry in value)
@@ -148,19 +150,27 @@ def integer_or_list(low: int, high: int, length: int) -> KeyKind:
     return KeyKind(f"{one.span}, or lists of {length}", {"anyOf": [one.schema, numbers]}, check)
 
 
-def number(low: float, high: float, unit: str = "", or_zero: bool = False) -> KeyKind:
-    """Accept a number from ``low`` to ``high``, with ``or_zero`` also 0."""
-    schema: dict[str, Any] = {"type": "number", "minimum": low, "maximum": high}
-    span = f"{low} … {high} {unit}".rstrip()
-    limits = f"{low} to {high} {unit}".rstrip()
-    problem = f"is outside {limits}"
-    if or_zero:
-        schema["minimum"] = 0
-        schema["not"] = {"exclusiveMinimum": 0, "exclusiveMaximum": low}
-        span = f"0, {span}"
-        problem = f"is neither 0 nor {limits}"
-        limits = f"0 or {limits}"
-    return _plain(span, problem, limits, **schema)
+def list_of(kind: KeyKind, span: str, example: str) -> KeyKind:
+    """Accept a list whose entries are all of one kind. Mistakes of all entries are reported.
+
+    ``example`` follows "is not a list of" in the error.
+    """
+
+    def check(value: Any) -> tuple[Any, ...]:
+        if not isinstance(value, list):
+            raise ValueError(f"{shown(value)} is not a list of {example}")
+        checked = []
+        problems = []
+        for entry in value:
+            try:
+                checked.append(kind.check(entry))
+            except ValueError as error:
+                problems.append(str(error))
+        if problems:
+            raise ValueError("; ".join(problems).replace("?; ", "? "))
+        return tuple(checked)
+
+    return KeyKind(span, {"type": "array", "items": kind.schema}, check)
 
 
 def pattern(
@@ -262,12 +272,6 @@ def _check_ratio(value: Any) -> Fraction:
     return ratio
 
 
-def _check_names(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list):
-        raise ValueError(f'{shown(value)} is not a list of names such as ["Motor_*"]')
-    return tuple(TEXT.check(name) for name in value)
-
-
 def _check_source(value: Any) -> Any:
     if isinstance(value, str):
         return TEXT.check(value)
@@ -297,7 +301,7 @@ _RATIO = r"[0-9]+(\.[0-9]+)?(/[0-9]+(\.[0-9]+)?)?"
 _RATIO_NUMBER = {"type": "number", "minimum": 0.001, "maximum": 1000}
 _RATIO_TEXT = {"type": "string", "pattern": f"^{_RATIO}$"}
 RATIO = KeyKind("0.001 … 1000", {"anyOf": [_RATIO_NUMBER, _RATIO_TEXT]}, _check_ratio)
-NAMES = KeyKind("list of strings", {"type": "array", "items": TEXT.schema}, _check_names)
+NAMES = list_of(TEXT, "list of strings", 'names such as ["Motor_*"]')
 _SOURCES = table_of(
     KeyKind("sources or numbers", {"anyOf": [TEXT.schema, {"type": "number"}]}, _check_source)
 )

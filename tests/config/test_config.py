@@ -19,8 +19,9 @@ from hypothesis import strategies as st
 
 import kontronik_can_gw
 from kontronik_can_gw.assembly.assemble import load_configuration
+from kontronik_can_gw.cli.schema import schema
 from kontronik_can_gw.config.conditions import condition
-from kontronik_can_gw.config.export import as_toml, schema
+from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, shipped
 from kontronik_can_gw.config.parse import load, parse
 from kontronik_can_gw.errors import UserError, did_you_mean
@@ -434,7 +435,7 @@ def test_no_mistake_of_any_key_has_a_value_as_python_writes_it() -> None:
     [
         ("can", "bitrate", True, "true is not an integer, 10000 to 1000000 bit/s"),
         ("can", "bitrate", 9999, "9999 is outside 10000 to 1000000 bit/s"),
-        ("can", "restart_after_s", 0.1, "0.1 is neither 0 nor 0.3 to 3600 s"),
+        ("can", "restart_after_s", 0.1, "0.1 is neither 0.3 to 3600 s nor 0"),
         ("can", "channel", 7, '7 is not a string. Write it in quotes: "7"'),
         ("can", "fd", {"b": True}, "{ b = true } is not true or false"),
         ("canopen", "node_id", "1", '"1" is not an integer, 1 to 127 or 255'),

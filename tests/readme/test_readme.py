@@ -23,7 +23,7 @@ from shell_blocks import PAGES as BY_HAND
 from shell_blocks import WORDS, Block, blocks, make_files, run_block
 
 from kontronik_can_gw.cli import COMMANDS
-from kontronik_can_gw.config.export import schema
+from kontronik_can_gw.cli.schema import schema
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 
