@@ -71,8 +71,8 @@ def e2e_row(protection: Protection) -> Any:
         start=profile.start << shift,
         final_xor=profile.final_xor << shift,
         crc_bytes=profile.crc_bytes,
-        id_bytes=protection.id_bytes,
-        is_id_last=int(protection.is_id_last),
+        id_bytes=profile.mode.id_bytes,
+        is_id_last=int(profile.mode.is_id_last),
     )
     row.data_id[:] = protection.ids_by_counter
     return row

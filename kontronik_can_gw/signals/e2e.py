@@ -15,11 +15,23 @@ DATA_IDS = 16
 class DataIdMode(Enum):
     """Bytes of the data ID in the CRC."""
 
-    BOTH = "both bytes before the frame, the low byte first"
-    ALTERNATING = "one byte before the frame: the low byte with an even counter, else the high byte"
-    NIBBLE = "the low byte and a 0 before the frame, which contains the other 4 bits"
-    LIST = "the counter's entry of a data ID list of 16, after the frame"
-    LAST = "both bytes after the frame, the low byte first"
+    BOTH = (16, 2, False)
+    """Both bytes before the frame, the low byte first."""
+    ALTERNATING = (16, 1, False)
+    """One byte before the frame: the low byte with an even counter, else the high byte."""
+    NIBBLE = (12, 2, False)
+    """The low byte and a 0 before the frame, which contains the other 4 bits."""
+    LIST = (8, 1, True)
+    """The counter's entry of a data ID list of 16, after the frame."""
+    LAST = (16, 2, True)
+    """Both bytes after the frame, the low byte first."""
+
+    def __init__(self, id_bits: int, id_bytes: int, is_id_last: bool) -> None:
+        self.id_bits = id_bits
+        self.id_bytes = id_bytes
+        """Number of bytes of the data ID in the CRC."""
+        self.is_id_last = is_id_last
+        """True if the data ID follows the frame in the CRC, False if it precedes the frame."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +67,7 @@ class Profile:
     @property
     def largest_id(self) -> int:
         """The largest data ID."""
-        bits = {DataIdMode.LIST: 8, DataIdMode.NIBBLE: 12}.get(self.mode, 16)
-        return (1 << bits) - 1
+        return (1 << self.mode.id_bits) - 1
 
 
 _P1 = Profile(
@@ -126,19 +137,9 @@ class Protection:
         """Bits 8 to 11 of the data ID, which a frame contains with DataIdMode.NIBBLE."""
         return self.data_ids[0] >> 8 & 0xF
 
-    @property
-    def id_bytes(self) -> int:
-        """Number of bytes of the data ID in the CRC."""
-        return 1 if self.profile.mode in (DataIdMode.ALTERNATING, DataIdMode.LIST) else 2
-
-    @property
-    def is_id_last(self) -> bool:
-        """True if the data ID follows the frame in the CRC, False if it precedes the frame."""
-        return self.profile.mode in (DataIdMode.LIST, DataIdMode.LAST)
-
     @cached_property
     def ids_by_counter(self) -> tuple[int, ...]:
-        """The number whose lowest ``id_bytes`` bytes enter the CRC, by the counter modulo 16."""
+        """The number whose lowest ``mode.id_bytes`` bytes enter the CRC, by counter modulo 16."""
         mode = self.profile.mode
         if mode is DataIdMode.LIST:
             return self.data_ids
@@ -151,10 +152,10 @@ class Protection:
 
     def crc(self, data: bytes, at: int, counter: int) -> int:
         """Return the CRC of a frame with this counter. ``at`` is the first byte of the CRC."""
-        number = self.ids_by_counter[counter % DATA_IDS]
-        data_id = (number & (1 << 8 * self.id_bytes) - 1).to_bytes(self.id_bytes, "little")
+        mode = self.profile.mode
+        data_id = self.ids_by_counter[counter % DATA_IDS].to_bytes(2, "little")[: mode.id_bytes]
         covered = data[:at] + data[at + self.profile.crc_bytes :]
-        covered = covered + data_id if self.is_id_last else data_id + covered
+        covered = covered + data_id if mode.is_id_last else data_id + covered
         bits = self.profile.crc_bits
         table = _crc_table(self.profile.polynomial, bits)
         mask = (1 << bits) - 1

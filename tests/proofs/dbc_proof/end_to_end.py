@@ -54,14 +54,14 @@ def expected_rule(profile: str, data_ids: tuple[int, ...]) -> CrcRule:
 def rule_of_python(protection: Protection) -> CrcRule:
     """Return the CRC that signals/e2e.py computes."""
     profile = protection.profile
-    mask = (1 << 8 * protection.id_bytes) - 1
+    mask = (1 << 8 * protection.profile.mode.id_bytes) - 1
     return CrcRule(
         polynomial=profile.polynomial,
         bits=profile.crc_bits,
         start=profile.start,
         final_xor=profile.final_xor,
-        id_bytes=protection.id_bytes,
-        is_id_last=protection.is_id_last,
+        id_bytes=protection.profile.mode.id_bytes,
+        is_id_last=protection.profile.mode.is_id_last,
         data_ids=tuple(number & mask for number in protection.ids_by_counter),
     )
 
