@@ -28,10 +28,12 @@ Mistake = tuple[EdsEntry, str]
 
 _PDOS = range(COMMUNICATION, COMMUNICATION + MAX_TPDOS)
 _MAPPINGS = range(MAPPING, MAPPING + MAX_TPDOS)
-_PLAIN = frozenset({0x1000, 0x1008, 0x1009})
-"""Objects that are not bound to a service."""
 _FREE = frozenset({0x1022, at.UNITS})
 """Objects without a service that may have any type, because copies of CiA's table differ."""
+_PLAIN = _FREE | {0x1000, 0x1008, 0x1009}
+"""Objects that are not bound to a service."""
+_NUMBERS_OF_ENTRIES = frozenset({0x1003, *_MAPPINGS})
+"""Objects whose sub-index 0 is a number that changes."""
 _LISTS = {0x1003: 0xFE, 0x1016: 0x7F, 0x1029: 0xFE, MAPPING: 0x40}
 """Lists that may be longer than in the shipped EDS, with their last possible sub-index."""
 _SERVER = {(0x1200, 1): SDO_REQUEST, (0x1200, 2): SDO_ANSWER}
@@ -50,7 +52,8 @@ def check_eds(
     access, and from 2000h on of the same kind. UserError with all mistakes.
     """
     entries = {(entry.index, entry.sub): entry for entry in eds.entries}
-    mistakes = [*_objects(entries, shipped), *_settings(entries, escs)]
+    known = {(entry.index, entry.sub): entry for entry in shipped.entries}
+    mistakes = [*_objects(entries, known), *_settings(entries, escs)]
     problems = [f"{entry.place} {entry.name}: {problem}" for entry, problem in mistakes]
     problems += _missing(entries)
     if not problems:
@@ -81,9 +84,14 @@ def _missing(entries: Mapping[EntryKey, EdsEntry]) -> Iterator[str]:
         yield f"{index:04X}h:{sub:02X} is mandatory but missing. Add it."
 
 
-def _objects(entries: Mapping[EntryKey, EdsEntry], shipped: Eds) -> Iterator[Mistake]:
-    """Yield mistakes in type, access and default of objects that telemetry and services use."""
-    known = {(entry.index, entry.sub): entry for entry in shipped.entries}
+def _objects(
+    entries: Mapping[EntryKey, EdsEntry], known: Mapping[EntryKey, EdsEntry]
+) -> Iterator[Mistake]:
+    """Yield mistakes in type, access and default of objects that telemetry and services use.
+
+    ``known`` are the entries of the shipped EDS.
+    """
+    last_subs = dict(entries.keys())
     for (index, sub), entry in entries.items():
         reference = _reference(known, index, sub)
         if reference is not None:
@@ -92,16 +100,12 @@ def _objects(entries: Mapping[EntryKey, EdsEntry], shipped: Eds) -> Iterator[Mis
         elif index < 0x2000:
             yield entry, "the gateway's nodes do not have this service. Remove the object."
         first = _SERVER.get((index, sub))
-        if first is not None and not (entry.default == first and entry.relative):
+        if first is not None and (entry.default, entry.relative) != (first, True):
             yield entry, f"must be $NODEID+0x{first:X}, the COB-ID of the SDO server."
-    for index, last in dict(entries.keys()).items():  # the last sub-index of each index
-        # sub-index 0 of the history and of mappings is a number that changes
-        is_count = index == 0x1003 or index in _MAPPINGS
-        first_entry = entries.get((index, 0))
-        if first_entry is None or is_count or not last:
-            continue
-        if first_entry.default != last:
-            yield first_entry, f"must be 0x{last:02X}, the highest sub-index."
+        last = last_subs[index]
+        is_wrong = sub == 0 < last and entry.default != last
+        if is_wrong and index not in _NUMBERS_OF_ENTRIES:
+            yield entry, f"must be 0x{last:02X}, the highest sub-index."
 
 
 def _reference(
@@ -128,19 +132,18 @@ def _reference(
 def _unlike(entry: EdsEntry, shipped: EdsEntry) -> Iterator[str]:
     """Yield the differences that make an object useless for its service."""
     index = entry.index
-    kind = entry.data_type
     wanted = shipped.data_type
-    if index in _FREE:
-        return
+    fitting = WHOLE
+    problem = "must be of a whole-number type."
     if index < 0x2000 or wanted not in WHOLE:
-        if kind != wanted:
-            yield f"must be of type {TYPE_NAMES[wanted]}, 0x{wanted:04X}."
-    elif kind not in WHOLE:
-        yield "must be of a whole-number type."
+        fitting = {wanted}
+        problem = f"must be of type {TYPE_NAMES[wanted]}, 0x{wanted:04X}."
     elif (index, entry.sub) not in BINDINGS:  # the object stores its value
-        bits = TYPE_BITS[wanted] if index != at.SETTINGS else 8
-        if kind in SIGNED or TYPE_BITS[kind] < bits:
-            yield f"must be of an unsigned type of {bits} bits or more."
+        bits = 8 if index == at.SETTINGS else TYPE_BITS[wanted]
+        fitting = {kind for kind in WHOLE - SIGNED if TYPE_BITS[kind] >= bits}
+        problem = f"must be of an unsigned type of {bits} bits or more."
+    if entry.data_type not in fitting and index not in _FREE:
+        yield problem
     if "w" not in shipped.access and "w" in entry.access and index not in _PLAIN:
         yield "must be read only (AccessType=ro or const), because only the node writes it."
 

@@ -294,8 +294,9 @@ class Dictionary:
 
         Returns the keys of stored values that were rejected because they do not fit this EDS.
         """
-        rejected = [number for number in stored if number not in self.variables]
-        for number, variable in self.variables.items():
+        held = self.variables
+        rejected = [key for key in stored if key >> 8 in profile and key not in held]
+        for number, variable in held.items():
             if number >> 8 not in profile:
                 continue
             variable.value = variable.default(node_id)

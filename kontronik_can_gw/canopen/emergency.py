@@ -127,19 +127,8 @@ class Emergencies:
         pending = self._last_ns + self._inhibit_ns if self._pending else NEVER
         return min(self._delayed_since, pending)
 
-    def set_word(
-        self,
-        word: int,
-        now: int,
-        at: int | None = None,
-        force: bool = False,
-    ) -> None:
-        """Take over the ESC's error word from a live frame that arrived ``at``.
-
-        ``force`` evaluates the word even if it did not change, because the mask changed.
-        """
-        if word == self._word and not force:
-            return
+    def set_word(self, word: int, now: int, at: int | None = None) -> None:
+        """Take over the ESC's error word from a live frame that arrived ``at``, and the mask."""
         self._word = word
         present, self._registered = self._bits.of(word, self.mask)
         ended = [

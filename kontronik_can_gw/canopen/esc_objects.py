@@ -61,7 +61,7 @@ class EscObjects:
         live = self._esc.live
         if live is not None and self._errors is not None:
             errors = self._errors.of(live)
-            self._emergencies.set_word(errors, now, force=True)
+            self._emergencies.set_word(errors, now)
         settings = esc_settings(self._dictionary, self._base)
         if settings != self._esc.settings:
             self._changed(settings)
@@ -86,10 +86,8 @@ class EscObjects:
                 emergencies.set(GatewayError.PORT_GONE, True, now)
             is_silent = link is LinkState.LOST
             emergencies.set(GatewayError.TELEMETRY_LOST, is_silent, now, at=esc.live_until_ns)
-            is_degraded = link is LinkState.DEGRADED
-            emergencies.set(GatewayError.CRC_RATE, is_degraded, now)
-            is_port_gone = link is LinkState.PORT_ERROR
-            emergencies.set(GatewayError.PORT_GONE, is_port_gone, now)
+            emergencies.set(GatewayError.CRC_RATE, link is LinkState.DEGRADED, now)
+            emergencies.set(GatewayError.PORT_GONE, link is LinkState.PORT_ERROR, now)
         info = esc.info
         if events & Event.INFO and info is not None and self._device is not None:
             device = esc.protocol.value("device_raw", info)

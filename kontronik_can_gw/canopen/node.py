@@ -30,10 +30,9 @@ from kontronik_can_gw.canopen.esc_objects import EscObjects
 from kontronik_can_gw.canopen.lss import Identity, LssSlave
 from kontronik_can_gw.canopen.nmt import Command, Consumer, Nmt, Producer
 from kontronik_can_gw.canopen.node_settings import NodeSetup
-from kontronik_can_gw.canopen.pdo import Tpdos
+from kontronik_can_gw.canopen.pdo import SyncConsumer, Tpdos
 from kontronik_can_gw.canopen.sdo import SdoServer
 from kontronik_can_gw.canopen.storage import Parameters, Stored, encode
-from kontronik_can_gw.canopen.sync import SyncConsumer
 from kontronik_can_gw.core.output import OutputHost
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.status import UNCONFIGURED, NmtState

@@ -110,5 +110,5 @@ class NodeSetup:
         if startup is not None and settings.self_start:
             startup.power_on = int(startup.power_on) & ~_SELF_START_OFF
         dictionary.read_only = settings.read_only
-        dictionary.reset(APPLICATION, settings.node_id, self.stored.application)
+        dictionary.reset(APPLICATION, settings.node_id, self.stored.values)
         return dictionary

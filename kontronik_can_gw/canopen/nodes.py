@@ -49,9 +49,6 @@ class Nodes(NodeOutput):
         self._to_watchers: deque[CanFrame] = deque()
         """Heartbeats of our nodes, for those of our nodes that watch them."""
         self._is_on = False
-        self._is_quiet = False
-        self._is_held = False
-        """True if no frame may leave. Frames of the return are made by it, not earlier."""
         self._reported: list[NodeState] = []
         """The states in the log."""
         numbers = range(len(host.escs))
@@ -100,51 +97,51 @@ class Nodes(NodeOutput):
         """Follow the CAN controller: another state, or DOWN again before a frame was sent."""
         if state is before and state is not CanState.DOWN:
             return
-        self._can_faults.on_state(state, self._is_held, now)
+        self._can_faults.on_state(state, now)
         self._finish(now)
 
     def can_returned(self, now: int, has_lost_frames: bool = False) -> None:
-        if self._is_quiet:
+        faults = self._can_faults
+        if faults.is_quiet:
             return
-        if self._is_held:
-            self._is_held = False
-            self._can_faults.silence(self._is_quiet or self._is_held, now)
+        if faults.is_held:
+            faults.set_silence(faults.is_quiet, False, now)
             self._is_on = True
-            self._can_faults.return_held(now)
+            faults.return_held(now)
         elif not self._is_on:
             self.start(now, can_open=True)
             return
         else:
-            self._can_faults.returned(now, has_lost_frames)
+            faults.returned(now, has_lost_frames)
         self._finish(now)
 
     def hold(self, now: int) -> None:
-        if not self._is_held:
-            self._is_held = True
-            self._can_faults.silence(self._is_quiet or self._is_held, now)
+        faults = self._can_faults
+        if not faults.is_held:
+            faults.set_silence(faults.is_quiet, True, now)
             self._finish(now)
 
     def first_frame(self, now: int) -> CanFrame | None:
         """Return a boot-up if a node boots now, or a heartbeat if a node sends heartbeats."""
         begin = len(self.frames)
-        if self._is_held and self._can_faults.boot_first(now):
+        is_held = self._can_faults.is_held
+        if is_held and self._can_faults.boot_first(now):
             self._is_on = True
             boot_up = self.frames.pop(begin)
             self._finish(now)
             return boot_up
         for node in self.nodes:
             # In captures of earlier versions, a heartbeat was sent even if 1017h is 0.
-            is_wanted = node.producer.is_on or not self._is_held
+            is_wanted = node.producer.is_on or not is_held
             if self._is_on and is_wanted and node.node_id != UNCONFIGURED:
                 return node.heartbeat()
         return None
 
     def set_quiet(self, is_quiet: bool, now: int) -> None:
-        self._is_quiet = is_quiet
-        self._can_faults.set_quiet(is_quiet)
+        self._can_faults.begin_outage()
         for node in self.nodes:
             node.consumer.set_quiet(is_quiet)
-        self._can_faults.silence(self._is_quiet or self._is_held, now)
+        self._can_faults.set_silence(is_quiet, self._can_faults.is_held, now)
         self._finish(now)
 
     def held_up(self, now: int) -> None:
@@ -315,7 +312,9 @@ class _CanFaults:
     def __init__(self, nodes: Sequence[Node]) -> None:
         self._nodes = nodes
         self._next_overrun_ns = 0
-        self._is_quiet = False
+        self.is_quiet = False
+        self.is_held = False
+        """True if no frame may leave. Frames of the return are made by it, not earlier."""
         self._is_on = False
         self._was_off = False
         self._has_outage = False
@@ -334,7 +333,7 @@ class _CanFaults:
         self._was_off = False
         self._has_outage = False
 
-    def on_state(self, state: CanState, is_held: bool, now: int) -> None:
+    def on_state(self, state: CanState, now: int) -> None:
         """Follow a new state of the CAN controller."""
         # Bus-off is worse than error-passive, so it does not end the emergency.
         if state in (CanState.ERROR_PASSIVE, CanState.ERROR_ACTIVE, CanState.ERROR_WARNING):
@@ -343,21 +342,22 @@ class _CanFaults:
                 node.emergencies.set(GatewayError.CAN_PASSIVE, is_passive, now)
         if state in (CanState.BUS_OFF, CanState.DOWN):
             self._was_off = self._was_off or state is CanState.BUS_OFF
-            self._has_outage = True
-            self._booted = []  # a boot-up that was under way is lost
+            self.begin_outage()  # a boot-up that was under way is lost
             for node in self._nodes:
                 node.nmt.behave(1, now)
-        elif self._has_outage and state is not CanState.UNKNOWN and not is_held:
+        elif self._has_outage and state is not CanState.UNKNOWN and not self.is_held:
             self.frames_pass(now)
 
-    def set_quiet(self, is_quiet: bool) -> None:
-        """Begin quiet mode, which is an outage for the nodes, or allow its end to be followed."""
-        self._is_quiet = is_quiet
+    def begin_outage(self) -> None:
+        """Note that frames cannot leave, or that quiet mode begins or ends, as after an outage."""
         self._has_outage = True
         self._booted = []
 
-    def silence(self, is_silent: bool, now: int) -> None:
+    def set_silence(self, is_quiet: bool, is_held: bool, now: int) -> None:
         """Let the nodes make no heartbeats and emergencies, or make them again."""
+        self.is_quiet = is_quiet
+        self.is_held = is_held
+        is_silent = is_quiet or is_held
         for node in self._nodes:
             node.emergencies.is_quiet = is_silent
             if node.producer.is_quiet is not is_silent:
@@ -407,7 +407,7 @@ class _CanFaults:
 
     def frames_pass(self, now: int) -> None:
         """Follow an interface that takes frames again after some were lost."""
-        if self._is_quiet:
+        if self.is_quiet:
             return
         for node in self._nodes:
             if self._has_outage:

@@ -43,6 +43,17 @@ _MIRRORS = range(0x6000, 0x6800)
 """Objects of CiA 402 that show values of others."""
 
 
+_RECORDED = {
+    "node_id": (1, 255),
+    "serial": (0, 0xFFFF_FFFF),
+    "vendor_id": (0, 0xFFFF_FFFF),
+    "bitrate": (1, 100_000_000),
+    "segment_ns": (0, LATEST_NS),
+    "device": (0, 0xFFFF),
+}
+"""The ranges of the numbers of a node in a capture. Those with the default None may be null."""
+
+
 class _Needs(NamedTuple):
     """The needs of all nodes on the bus."""
 
@@ -337,20 +348,14 @@ def recorded(found: Mapping[str, Any], _escs: Sequence[EscSettings]) -> CanopenS
 
 
 def _node(found: Mapping[str, Any]) -> NodeSettings:
-    device = found["device"]
-    if device is not None:
-        device = whole_number(device, 0, 0xFFFF)
-    vendor_id = found["vendor_id"]
-    if vendor_id is not None:
-        vendor_id = whole_number(vendor_id, 0, 0xFFFF_FFFF)
+    numbers: dict[str, Any] = {}
+    for name, limits in _RECORDED.items():
+        value = found[name]
+        is_absent = value is None and getattr(NodeSettings, name, 0) is None
+        numbers[name] = None if is_absent else whole_number(value, *limits)
     return NodeSettings(
-        node_id=whole_number(found["node_id"], 1, 255),
-        serial=whole_number(found["serial"], 0, 0xFFFF_FFFF),
-        vendor_id=vendor_id,
         self_start=bool(found["self_start"]),
         read_only=bool(found["read_only"]),
-        bitrate=whole_number(found["bitrate"], 1, 100_000_000),
-        segment_ns=whole_number(found["segment_ns"], 0, LATEST_NS),
         version=short_text(found["version"], 100),
-        device=device,
+        **numbers,
     )

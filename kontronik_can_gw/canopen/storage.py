@@ -17,7 +17,7 @@ import json
 import re
 import zlib
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -36,10 +36,8 @@ CHECKED = frozenset({0x1005, 0x1014, 0x1016, 0x1019, 0x1F80})
 """Objects whose values have rules beyond type and limits, except PDOs, which check their own."""
 _NO_CONFIGURATION = frozenset({0x1003, 0x1010, 0x1011, VERIFY, at.RESET_STATISTICS})
 """Objects that can be written but are not part of a configuration."""
-_ALL_OR_COMMUNICATION = (1, 2)
-"""Sub-indices of 1010h and 1011h that concern communication parameters."""
-_ALL_OR_APPLICATION = (1, 3)
-"""Sub-indices of 1010h and 1011h that concern application parameters."""
+_PARAMETERS = {1: range(0x1000, 0x10000), 2: COMMUNICATION, 3: APPLICATION}
+"""The indices that each sub-index of 1010h and 1011h concerns."""
 _MAX_SAVES = 4
 """Maximum number of pending saves."""
 
@@ -51,49 +49,43 @@ _HEADER = re.compile(
 
 @dataclass(frozen=True)
 class Stored:
-    """The parameters that one node keeps over a restart.
-
-    Keys of both mappings are index << 8 | sub-index. Values are raw little-endian bytes.
-    """
+    """The parameters that one node keeps over a restart."""
 
     node_id: int | None = None
     """1..127, or 255 (unconfigured), as set over the bus. None: the configured one is used."""
-    communication: Mapping[int, bytes] = field(default_factory=dict)
-    """Objects 1000h..1FFFh."""
-    application: Mapping[int, bytes] = field(default_factory=dict)
-    """Objects 2000h..FFFFh."""
+    values: Mapping[int, bytes] = field(default_factory=dict)
+    """Raw little-endian bytes by index << 8 | sub-index. The indices are 1000h..FFFFh."""
 
     @property
     def has_ids(self) -> bool:
         """True if it holds a node-ID or COB-IDs."""
-        has_cob_id = any(key >> 8 in _WITH_COB_ID for key in self.communication)
-        return self.node_id is not None or has_cob_id
+        return self.node_id is not None or any(key >> 8 in _WITH_COB_ID for key in self.values)
 
     def without_ids(self) -> "Stored":
         """Return a copy without the node-ID and COB-IDs."""
-        held = self.communication.items()
-        left = {key: data for key, data in held if key >> 8 not in _WITH_COB_ID}
-        return replace(self, node_id=None, communication=left).unverified()
+        return Stored(None, self.without(_WITH_COB_ID)).unverified()
 
     def unverified(self) -> "Stored":
         """Return a copy without 1020h, because it does not describe this configuration."""
-        held = self.communication.items()
-        left = {key: data for key, data in held if key >> 8 != VERIFY}
-        return replace(self, communication=left)
+        return Stored(self.node_id, self.without((VERIFY,)))
+
+    def without(self, indices: Container[int]) -> dict[int, bytes]:
+        """Return the values of all other indices."""
+        return {key: data for key, data in self.values.items() if key >> 8 not in indices}
 
 
 def encode(stored: Stored) -> bytes:
     """Return the text of the file in ASCII, which is the same for equal content.
 
-    ValueError for an impossible node-ID, or for a key that is not in its mapping's range.
+    ValueError for an impossible node-ID.
     """
     node_id = stored.node_id
     if node_id is not None and not _is_node_id(node_id):
         raise ValueError(f"node_id {node_id!r} is not 1..127, 255 or null")
     content = {
         "node_id": node_id,
-        "communication": _texts(stored.communication, COMMUNICATION),
-        "application": _texts(stored.application, APPLICATION),
+        "communication": _texts(stored.values, COMMUNICATION),
+        "application": _texts(stored.values, APPLICATION),
     }
     body = _line(content)
     header = {
@@ -124,9 +116,10 @@ def decode(data: bytes) -> Stored:
         raise ValueError("the content does not match its CRC-32: damaged or truncated")
     try:
         content = json.loads(body)
-        communication = _values(content["communication"])
-        application = _values(content["application"])
-        stored = Stored(content["node_id"], communication, application)
+        values = {}
+        for address, text in (content["communication"] | content["application"]).items():
+            values[int(address.replace(":", ""), 16)] = bytes.fromhex(text)
+        stored = Stored(content["node_id"], values)
         if encode(stored) == data:
             return stored
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
@@ -147,22 +140,12 @@ def _line(content: Mapping[str, Any]) -> bytes:
 
 
 def _texts(values: Mapping[int, bytes], indices: range) -> dict[str, str]:
-    for key in values:
-        if key >> 8 not in indices:
-            raise ValueError(f"{key >> 8:04X}h is not {indices[0]:04X}h to {indices[-1]:04X}h")
+    """Return the values of these indices as in the file."""
     texts = {}
     for key in sorted(values):
-        address = f"{key >> 8:04X}:{key & 0xFF:02X}"
-        texts[address] = values[key].hex().upper()
+        if key >> 8 in indices:
+            texts[f"{key >> 8:04X}:{key & 0xFF:02X}"] = values[key].hex().upper()
     return texts
-
-
-def _values(texts: Mapping[str, str]) -> dict[int, bytes]:
-    values = {}
-    for address, text in texts.items():
-        key = int(address.replace(":", ""), 16)
-        values[key] = bytes.fromhex(text)
-    return values
 
 
 class Parameters:
@@ -209,18 +192,16 @@ class Parameters:
 
     def reset_application(self, node_id: int) -> None:
         """Set 2000h..FFFFh to their power-on values."""
-        stored = self._stored.application
-        self.rejected = self._dictionary.reset(APPLICATION, node_id, stored)
+        self.rejected = self._dictionary.reset(APPLICATION, node_id, self._stored.values)
 
     def reset_communication(self, node_id: int) -> None:
         """Set 1000h..1FFFh to their power-on values."""
         self._node_id = node_id
-        stored = self._stored.communication
-        self.rejected += self._dictionary.reset(COMMUNICATION, node_id, stored)
+        self.rejected += self._dictionary.reset(COMMUNICATION, node_id, self._stored.values)
 
     def reject_what_breaks_rules(self) -> None:
         """Replace stored communication parameters that a download would refuse by the defaults."""
-        for number in self._stored.communication:
+        for number in self._stored.values:
             variable = self._dictionary.variables.get(number)
             if variable is None or variable.check is None or number >> 8 not in CHECKED:
                 continue
@@ -234,7 +215,7 @@ class Parameters:
     def verify(self) -> None:
         """Clear 1020h at a reset if the present parameters are not the ones stored with it."""
         application = self._dictionary.to_store(APPLICATION, self._node_id)
-        if self.rejected or application != self._stored.application:
+        if self.rejected or application != self._stored.without(COMMUNICATION):
             self._configuration_changed()
 
     # --- changes
@@ -278,15 +259,12 @@ class Parameters:
 
         Returns False, because the SDO server must wait for the result.
         """
-        communication = self._dictionary.to_store(COMMUNICATION, self._node_id)
-        application = self._dictionary.to_store(APPLICATION, self._node_id)
-        stored = self._wanted
-        if part in _ALL_OR_COMMUNICATION:
-            stored = replace(stored, communication=communication)
-        if part in _ALL_OR_APPLICATION:
-            stored = replace(stored, application=application, node_id=self.set_node_id)
-        is_whole = stored.communication == communication and stored.application == application
-        if not is_whole:
+        indices = _PARAMETERS[part]
+        to_store = self._dictionary.to_store
+        values = self._wanted.without(indices) | to_store(indices, self._node_id)
+        node_id = self._wanted.node_id if part == 2 else self.set_node_id
+        stored = Stored(node_id, values)
+        if values != to_store(_PARAMETERS[1], self._node_id):
             stored = stored.unverified()
         self._save(self._sdo.waiting, stored)
         return False
@@ -297,11 +275,8 @@ class Parameters:
         A node-ID that LSS stored is kept. LSS removes it. Returns False, because the SDO server
         must wait for the result.
         """
-        stored = self._wanted
-        if part in _ALL_OR_COMMUNICATION:
-            stored = replace(stored, communication={})
-        if part in _ALL_OR_APPLICATION:
-            stored = replace(stored, application={})
+        wanted = self._wanted
+        stored = Stored(wanted.node_id, wanted.without(_PARAMETERS[part]))
         self._save(self._sdo.waiting, stored.unverified())
         return False
 

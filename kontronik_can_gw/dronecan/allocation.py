@@ -60,13 +60,13 @@ class Allocation:
         taken: set[int],
         now: int,
     ) -> int | None:
-        """Process an Allocation message. Returns the node-ID that was allocated to us, or None.
+        """Process an Allocation message while asking.
+
+        Returns the node-ID that was allocated to us, or None.
 
         ``source`` is the allocation server's node-ID, or 0 if the message is the request of another
         client. A node-ID in ``taken`` is refused.
         """
-        if self.due == NEVER:
-            return None
         repeated = payload[1:]
         is_ours = source and repeated and self._unique_id.startswith(repeated)
         self._restart(now)

@@ -6,13 +6,12 @@ A node sends its status and log messages, and answers requests.
 import struct
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from kontronik_can_gw.core.output import LogLine, Output, OutputHost, Owner
 from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.allocation import Allocation
 from kontronik_can_gw.dronecan.esc_report import EscReport
-from kontronik_can_gw.dronecan.node_setup import DronecanNodeSetup, Given
 from kontronik_can_gw.dronecan.wire import NODE, REQUEST, SERVICE, Assembler, DataType
 from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.frames import CanFrame, id_block
@@ -33,6 +32,30 @@ MAX_ANSWERS = 50
 """Maximum number of answers in a second, so that requests cannot keep the bus busy."""
 _ALLOCATIONS = frozenset((id_block(0x100, 0xFFFF80), id_block(0x100, 0x3FF)))
 """Ids of Allocation messages: those of an allocation server, and the requests of other clients."""
+
+
+class DronecanNodeSetup(NamedTuple):
+    """The settings of one node."""
+
+    node_id: int
+    """0 if an allocation server chooses it."""
+    name: str
+    unique_id: bytes
+    escs: tuple[int, ...]
+    """The numbers of its ESCs."""
+
+
+class Given(NamedTuple):
+    """The data from which all nodes are made. A capture holds them."""
+
+    table: Any
+    """The DronecanConfig."""
+    identity: bytes
+    """A digest of the numbers that identify this machine. It is empty if there are none."""
+    version: tuple[int, int]
+    """Major and minor version of the program."""
+    seed: int
+    """A random number of 64 bits, chosen at each start."""
 
 
 class DronecanNode:

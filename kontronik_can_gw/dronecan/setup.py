@@ -12,8 +12,7 @@ from kontronik_can_gw.core.header_parts import reading, whole_number
 from kontronik_can_gw.core.output import OutputHost
 from kontronik_can_gw.core.output_setup import HostMachine, OutputSetup
 from kontronik_can_gw.dronecan.esc_report import MAX_ESC_INDEX, MAX_RPM, SPEEDS
-from kontronik_can_gw.dronecan.node_setup import DronecanNodeSetup, Given
-from kontronik_can_gw.dronecan.nodes import Dronecan
+from kontronik_can_gw.dronecan.nodes import Dronecan, DronecanNodeSetup, Given
 from kontronik_can_gw.dronecan.wire import MAX_NODE_ID, NODE
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings

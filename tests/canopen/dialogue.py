@@ -403,7 +403,7 @@ def _place(name: str) -> tuple[int, int]:
 
 def _stored_text(stored: Stored) -> str:
     """Return stored data as text, for example ``node-id 7 1017:00=F401 2100:01=05``."""
-    values = sorted({**stored.communication, **stored.application}.items())
+    values = sorted(stored.values.items())
     texts = [f"{_name(number)}={data.hex().upper()}" for number, data in values]
     node_id = [] if stored.node_id is None else ["node-id", str(stored.node_id)]
     return " ".join([*node_id, *texts])
@@ -414,14 +414,12 @@ def _stored(words: Sequence[str]) -> Stored:
     if words[:1] == ["node-id"]:
         node_id = int(words[1])
         words = words[2:]
-    communication: dict[int, bytes] = {}
-    application: dict[int, bytes] = {}
+    values: dict[int, bytes] = {}
     for word in words:
         name, _, data = word.partition("=")
         index, sub = _place(name)
-        kept = application if index >= 0x2000 else communication
-        kept[index << 8 | sub] = bytes.fromhex(data)
-    return Stored(node_id, communication, application)
+        values[index << 8 | sub] = bytes.fromhex(data)
+    return Stored(node_id, values)
 
 
 def bench_of(options: Sequence[str]) -> Bench:

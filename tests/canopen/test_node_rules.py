@@ -209,7 +209,7 @@ def test_no_stored_value_prevents_the_gateway_from_starting(
     "clashing",
     [
         Stored(2),
-        Stored(communication={0x101400: u32(0x82)}),
+        Stored(values={0x101400: u32(0x82)}),
     ],
 )
 def test_1020h_is_cleared_if_a_value_stored_with_it_is_rejected(
@@ -218,7 +218,7 @@ def test_1020h_is_cleared_if_a_value_stored_with_it_is_rejected(
 ) -> None:
     verify = {0x102001: u32(15685), 0x102002: u32(43_200_000), 0x101700: b"\xf4\x01"}
     for stored, expected in ((Stored(7), 15685), (clashing, 0)):
-        keep(tmp_path, esc1=Stored(stored.node_id, {**stored.communication, **verify}))
+        keep(tmp_path, esc1=Stored(stored.node_id, {**stored.values, **verify}))
         _, nodes = loaded_nodes(tmp_path)
         number = nodes[0].dictionary.number
         assert number(0x1020, 1) == expected

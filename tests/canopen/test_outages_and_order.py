@@ -38,7 +38,7 @@ def test_answers_of_a_node_are_never_overtaken() -> None:
 
 @pytest.mark.promise("parameters")
 def test_stored_value_that_does_not_fit_is_reported_once_at_each_reset() -> None:
-    stored = Stored(communication={0x101700: b"\x01"}, application={0x210001: bytes(9)})
+    stored = Stored(values={0x101700: b"\x01", 0x210001: bytes(9)})
     bench = Bench(changes=QUIET, stored=[stored])
     assert sorted(bench.gateway.take_rejected_parameters()) == [(0, 0x101700), (0, 0x210001)]
     for _ in range(3):

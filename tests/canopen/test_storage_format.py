@@ -14,8 +14,14 @@ pytestmark = pytest.mark.promise("parameters")
 
 SAMPLE = Stored(
     7,
-    {0x101700: b"\xf4\x01", 0x140001: bytes.fromhex("81010040"), 0x1A0000: b"\0"},
-    {0x210001: b"\x07", 0x9FFFFF: b"", 0x200000: bytes(range(16))},
+    {
+        0x101700: b"\xf4\x01",
+        0x140001: bytes.fromhex("81010040"),
+        0x1A0000: b"\0",
+        0x210001: b"\x07",
+        0x9FFFFF: b"",
+        0x200000: bytes(range(16)),
+    },
 )
 TEXT = b"""{"format":"kontronik-can-gw parameters","version":1,"crc32":"%08X"}
 {"node_id":7,"communication":{"1017:00":"F401","1400:01":"81010040","1A00:00":"00"},\
@@ -48,8 +54,7 @@ values = st.binary(max_size=12)
 stores = st.builds(
     Stored,
     st.one_of(st.none(), st.integers(1, 127), st.just(255)),
-    st.dictionaries(st.integers(0x100000, 0x1FFFFF), values),
-    st.dictionaries(st.integers(0x200000, 0x9FFFFF), values),
+    st.dictionaries(st.integers(0x100000, 0x9FFFFF), values),
 )
 
 

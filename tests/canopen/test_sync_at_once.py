@@ -4,7 +4,7 @@ import pytest
 from dialogue import NO_HEARTBEAT, QUIET, Bench, live, tpdo
 
 from kontronik_can_gw.canopen.objects import GATEWAY
-from kontronik_can_gw.canopen.sync import MAX_WAITING
+from kontronik_can_gw.canopen.pdo import MAX_WAITING
 from kontronik_can_gw.frames import CanFrame
 
 pytestmark = pytest.mark.promise("sync")

@@ -32,7 +32,7 @@ from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.core.output_setup import OutputSetup, ReadyOutput
 from kontronik_can_gw.core.settings import CoreSettings
-from kontronik_can_gw.dronecan.node_setup import Given
+from kontronik_can_gw.dronecan.nodes import Given
 from kontronik_can_gw.dronecan.setup import DronecanSetup
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData

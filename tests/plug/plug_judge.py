@@ -126,7 +126,7 @@ def judge_parameters(verdict: Verdict, folder: Path, allowed: Container[int]) ->
         return
     numbers = {0}
     if stored is not None:
-        values = (stored.application.get(TIMEOUT, b""), stored.communication.get(HEARTBEAT, b""))
+        values = [stored.values.get(key, b"") for key in (TIMEOUT, HEARTBEAT)]
         numbers = {int.from_bytes(value, "little") - LOWEST for value in values}
     if len(numbers) > 1:
         verdict.problems.append(f"parameters: a mixture of the sets {sorted(numbers)}")

@@ -98,9 +98,9 @@ def test_reference_with_a_missing_block_is_refused(tmp_path: Path) -> None:
 
 
 def parameters(timeout: int, heartbeat: int) -> bytes:
-    values = {key: (LOWEST + n).to_bytes(2, "little") for key, n in ((TIMEOUT, timeout),)}
-    others = {HEARTBEAT: (LOWEST + heartbeat).to_bytes(2, "little")}
-    return encode(Stored(None, others, values))
+    numbers = {HEARTBEAT: heartbeat, TIMEOUT: timeout}
+    values = {key: (LOWEST + number).to_bytes(2, "little") for key, number in numbers.items()}
+    return encode(Stored(None, values))
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.core.settings import CoreSettings
-from kontronik_can_gw.dronecan.node_setup import Given
+from kontronik_can_gw.dronecan.nodes import Given
 from kontronik_can_gw.dronecan.setup import DronecanSetup
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame

@@ -24,15 +24,15 @@ PATIENCE = 30.0
 
 def numbered(number: int, size: int = 16) -> bytes:
     """Return the content of a file that has a number and ``size`` further bytes."""
-    application = {
+    values = {
         0x210001: number.to_bytes(4, "little"),
         0x210002: bytes(size),
     }
-    return encode(Stored(None, {}, application))
+    return encode(Stored(None, values))
 
 
 def number_of(stored: Stored) -> int:
-    return int.from_bytes(stored.application.get(0x210001, b""), "little")
+    return int.from_bytes(stored.values.get(0x210001, b""), "little")
 
 
 OLD = numbered(1)

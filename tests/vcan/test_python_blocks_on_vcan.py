@@ -126,9 +126,9 @@ def test_example_stores_settings_and_a_pdo_across_a_restart(vcan: str, tmp_path:
     (block,) = example("store()")
     output_of(block, tmp_path, after=AFTER_RESTART)
     stored = decode((tmp_path / "store" / "esc1.params").read_bytes())
-    assert stored.application == {0x210001: b"\x07"}
-    assert stored.communication[0x101700] == (500).to_bytes(2, "little")
-    assert stored.communication[0x180401] == (0x400001A1).to_bytes(4, "little")
+    assert stored.values[0x210001] == b"\x07"
+    assert stored.values[0x101700] == (500).to_bytes(2, "little")
+    assert stored.values[0x180401] == (0x400001A1).to_bytes(4, "little")
 
 
 def test_example_sets_the_node_id_of_a_waiting_node(vcan: str, tmp_path: Path) -> None:
