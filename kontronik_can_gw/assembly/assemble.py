@@ -230,7 +230,7 @@ def assemble(config: Config, store: "ParameterStore | None" = None) -> Loaded:
         warnings += fitted.warnings(config.file, config.can.bitrate)
         damaged += fitted.faults
     settings = config.core_settings(escs, dbc.layout)
-    mute = unreported(settings) + unsupplied(settings) + without_quiet(settings)
+    mute = [*unreported(settings), *unsupplied(settings), *without_quiet(settings)]
     return Loaded(
         config=config,
         escs=escs,

@@ -14,7 +14,7 @@ from kontronik_can_gw.canopen.eds import FLOATS, TYPE_BITS, EdsEntry, range_of
 from kontronik_can_gw.canopen.objects import LINK, Bound, bindings_of
 from kontronik_can_gw.core.slots import SlotPlan
 from kontronik_can_gw.esc.telemetry import EscTelemetry, Event
-from kontronik_can_gw.esc.values import Group, Kind
+from kontronik_can_gw.esc.values import Group, Kind, steps, steps_of
 from kontronik_can_gw.esc.values import Value as EscValue
 from kontronik_can_gw.signals.packer import compile_pack, place
 from kontronik_can_gw.signals.plan import MessagePlan, Piece, SignalPlan
@@ -69,15 +69,15 @@ def _read(
     esc, gateway = source
     low, high = range_of(data_type)
     behaviour = dictionary.number(at.SETTINGS, 5)
-    value = None
+    count = None
     reason = Abort.NO_DATA
     if bound.source.group is not Group.LIVE or esc.live is not None:
-        value = bound.read(esc, gateway, now, high)
+        count = steps(bound.source, esc, gateway, now)
+    elif behaviour == _LAST_VALUE:
+        count = steps_of(bound.source, esc, esc.last_live)
     elif esc.last_live is not None:
-        if behaviour == _LAST_VALUE:
-            value = bound.last(esc, high)
-        else:
-            reason = Abort.DEVICE_STATE
+        reason = Abort.DEVICE_STATE
+    value = bound.shown(esc, count, high)
     if value is not None and low <= value <= high:
         return value
     if behaviour == _CODES:

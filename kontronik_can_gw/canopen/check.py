@@ -36,6 +36,8 @@ _NUMBERS_OF_ENTRIES = frozenset({0x1003, *_MAPPINGS})
 """Objects whose sub-index 0 is a number that changes."""
 _LISTS = {0x1003: 0xFE, 0x1016: 0x7F, 0x1029: 0xFE, MAPPING: 0x40}
 """Lists that may be longer than in the shipped EDS, with their last possible sub-index."""
+_BITS = {at.SETTINGS: 8}
+"""Least numbers of bits of objects that store their values, if not as in the shipped EDS."""
 _SERVER = {(0x1200, 1): SDO_REQUEST, (0x1200, 2): SDO_ANSWER}
 _MANDATORY = {(0x1000, 0), (0x1001, 0), (0x1018, 1)}
 
@@ -100,7 +102,7 @@ def _objects(
         elif index < 0x2000:
             yield entry, "the gateway's nodes do not have this service. Remove the object."
         first = _SERVER.get((index, sub))
-        if first is not None and (entry.default, entry.relative) != (first, True):
+        if first is not None and (entry.default, entry.is_relative) != (first, True):
             yield entry, f"must be $NODEID+0x{first:X}, the COB-ID of the SDO server."
         last = last_subs[index]
         is_wrong = sub == 0 < last and entry.default != last
@@ -139,7 +141,7 @@ def _unlike(entry: EdsEntry, shipped: EdsEntry) -> Iterator[str]:
         fitting = {wanted}
         problem = f"must be of type {TYPE_NAMES[wanted]}, 0x{wanted:04X}."
     elif (index, entry.sub) not in BINDINGS:  # the object stores its value
-        bits = 8 if index == at.SETTINGS else TYPE_BITS[wanted]
+        bits = _BITS.get(index, TYPE_BITS[wanted])
         fitting = {kind for kind in WHOLE - SIGNED if TYPE_BITS[kind] >= bits}
         problem = f"must be of an unsigned type of {bits} bits or more."
     if entry.data_type not in fitting and index not in _FREE:
@@ -182,7 +184,7 @@ def _defaults(eds: Eds, settings: EscSettings, node_id: int) -> Iterator[str]:
         try:
             variable.check(value)
         except SdoAbort as error:
-            of_node = f" (node-ID {node_id})" if entry.relative else ""
+            of_node = f" (node-ID {node_id})" if entry.is_relative else ""
             problem = f"DefaultValue {value:#x}{of_node} is not allowed ({error})."
             yield f"{entry.place} {entry.name}: {problem}"
     for tpdo in node.tpdos:

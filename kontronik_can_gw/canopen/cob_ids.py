@@ -23,16 +23,15 @@ INVALID_BIT = 1 << 31
 SYNC = "SYNC"
 
 
-def restricted(cob_id: int) -> bool:
-    """Return True if no PDO, SYNC or EMCY may use the COB-ID (CiA 301, restricted CAN-IDs)."""
-    return (
-        cob_id <= 0x07F
-        or 0x101 <= cob_id <= 0x180
-        or 0x581 <= cob_id <= 0x5FF
-        or 0x601 <= cob_id <= 0x67F
-        or 0x6E0 <= cob_id <= 0x6FF
-        or cob_id >= 0x701
-    )
+_RESTRICTED = (
+    range(0x080),
+    range(0x101, 0x181),
+    range(0x581, 0x600),
+    range(0x601, 0x680),
+    range(0x6E0, 0x700),
+    range(0x701, 0x800),
+)
+"""COB-IDs that no PDO, SYNC or EMCY may use (CiA 301, restricted CAN-IDs)."""
 
 
 def check_free(cob_id: int, user: object, taken: Taken) -> None:
@@ -40,7 +39,7 @@ def check_free(cob_id: int, user: object, taken: Taken) -> None:
 
     Raises SdoAbort 06090030h for a restricted COB-ID, and 06040043h for one in use.
     """
-    if restricted(cob_id):
+    if any(cob_id in ids for ids in _RESTRICTED):
         raise SdoAbort(Abort.VALUE)
     if taken(cob_id, user):
         raise SdoAbort(Abort.INCOMPATIBLE)
@@ -69,5 +68,5 @@ class Use(NamedTuple):
 
     ``SYNC`` stands for the SYNC services of all nodes, which share one COB-ID.
     """
-    own: bool = False
+    is_own: bool = False
     """True if no other device on the bus may send with it."""

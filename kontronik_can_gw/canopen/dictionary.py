@@ -107,11 +107,11 @@ class Variable:
         return _MAX_DOMAIN if self.entry.data_type == DOMAIN_TYPE else _MAX_TEXT
 
     @property
-    def readable(self) -> bool:
+    def is_readable(self) -> bool:
         return self.entry.access != "wo"
 
     @property
-    def writable(self) -> bool:
+    def is_writable(self) -> bool:
         return "w" in self.entry.access
 
     def encode(self, value: Value) -> bytes:
@@ -141,7 +141,7 @@ class Variable:
 
     def default(self, node_id: int) -> Value:
         """Return the power-on value of a node with this node-ID, which replaces ``$NODEID``."""
-        if self.entry.relative and isinstance(self.power_on, int):
+        if self.entry.is_relative and isinstance(self.power_on, int):
             return self.power_on + node_id
         return self.power_on
 
@@ -156,7 +156,7 @@ def signature(word: bytes) -> Check:
     return check
 
 
-def _ignore(_variable: Variable, _changed: bool, _now: int) -> None:
+def _ignore(_variable: Variable, _has_changed: bool, _now: int) -> None:
     """Do nothing after a download."""
 
 
@@ -241,7 +241,7 @@ class Dictionary:
     def upload(self, index: int, sub: int, now: int) -> bytes:
         """Return the bytes of a variable. SdoAbort if it is absent, write only or has no value."""
         variable = self.find(index, sub)
-        if not variable.readable:
+        if not variable.is_readable:
             raise SdoAbort(Abort.WRITE_ONLY)
         return variable.encode(self.value(variable, now))
 
@@ -253,7 +253,7 @@ class Dictionary:
         variable = self.find(index, sub)
         if self.read_only:
             raise SdoAbort(Abort.DEVICE_STATE)
-        if not variable.writable:
+        if not variable.is_writable:
             raise SdoAbort(Abort.READ_ONLY)
         if size is not None and size > variable.max_size:
             raise SdoAbort(Abort.TOO_LONG)
@@ -276,10 +276,10 @@ class Dictionary:
         if variable.check is not None:
             assert isinstance(value, int)
             variable.check(value)
-        changed = self.value(variable, now) != value
+        has_changed = self.value(variable, now) != value
         variable.value = value
         is_confirmed_later = variable.written is not None and variable.written(now) is False
-        self.written(variable, changed, now)
+        self.written(variable, has_changed, now)
         return not is_confirmed_later
 
     # --- power-on and storage
@@ -304,7 +304,7 @@ class Dictionary:
             if data is None:
                 continue
             has_wrong_size = variable.size is not None and len(data) != variable.size
-            if not variable.writable or has_wrong_size:
+            if not variable.is_writable or has_wrong_size:
                 rejected.append(number)
                 continue
             value = variable.decode(data)

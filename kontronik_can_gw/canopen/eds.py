@@ -154,9 +154,10 @@ class Section:
 
         ValueError if the value is not a number.
         """
-        text = self.get(key)
-        if not text:
-            return otherwise
+        return self.number_of(key, self.get(key) or str(otherwise))
+
+    def number_of(self, key: str, text: str) -> int:
+        """Return the number of a text that is a part of a key's value. ValueError if it is none."""
         number = integer(text)
         if number is None:
             raise ValueError(f"{self.quoted(key)}: not a number. Use the form 0x1F or 31.")
@@ -257,7 +258,7 @@ class EdsEntry:
     """One entry of the object dictionary, as the EDS describes it.
 
     ``access`` is ro, wo, rw, rwr, rww or const. ``default`` is an int, a float, or bytes for texts
-    and domains. If ``relative``, the node-ID must be added to it.
+    and domains. If ``is_relative``, the node-ID must be added to it.
     """
 
     index: int
@@ -265,11 +266,11 @@ class EdsEntry:
     name: str
     data_type: int
     access: str
-    mappable: bool
+    is_mappable: bool
     low: int | None
     high: int | None
     default: int | float | bytes | None
-    relative: bool
+    is_relative: bool
 
     @property
     def place(self) -> str:
@@ -389,8 +390,8 @@ def _entry(section: Section, index: int, sub: int) -> EdsEntry:
         raise ValueError(f"{section.quoted('AccessType')}: not one of {', '.join(_ACCESS)}.")
     low = _limit(section, "LowLimit", data_type)
     high = _limit(section, "HighLimit", data_type)
-    default, relative = _default(section, data_type)
-    if isinstance(default, int) and not relative:
+    default, is_relative = _default(section, data_type)
+    if isinstance(default, int) and not is_relative:
         _check_limits(section, default, low, high)
     return EdsEntry(
         index=index,
@@ -398,11 +399,11 @@ def _entry(section: Section, index: int, sub: int) -> EdsEntry:
         name=section.get("ParameterName"),
         data_type=data_type,
         access=access,
-        mappable=bool(section.number("PDOMapping")),
+        is_mappable=bool(section.number("PDOMapping")),
         low=low,
         high=high,
         default=default,
-        relative=relative,
+        is_relative=is_relative,
     )
 
 
@@ -435,9 +436,7 @@ def _fitting(
 
     Signed numbers may be hexadecimal in two's complement. ValueError for a mistake.
     """
-    number = integer(text)
-    if number is None:
-        raise ValueError(f"{section.quoted(key)}: not a number. Use the form 0x1F or 31.")
+    number = section.number_of(key, text)
     low, high = range_of(data_type)
     is_hexadecimal = "x" in text.lower()
     if data_type in SIGNED and is_hexadecimal and high < number <= high - low:

@@ -146,7 +146,7 @@ class Emergencies:
     def set(
         self,
         error: GatewayError,
-        present: bool,
+        is_present: bool,
         now: int,
         detail: int | None = None,
         at: int | None = None,
@@ -159,11 +159,11 @@ class Emergencies:
         if detail is None:
             detail = own_detail
         condition = PresentError(code, FROM_GATEWAY, detail)
-        if present and condition not in self._active:
+        if is_present and condition not in self._active:
             if error is GatewayError.TELEMETRY_LOST and self._is_open:
                 self._delayed_since = min(self._delayed_since, now)
             self._begin(condition, now, at)
-        elif not present and condition in self._active:
+        elif not is_present and condition in self._active:
             del self._active[condition]
             self._end(now)
 
@@ -295,11 +295,11 @@ class Emergencies:
         """Report 0000h if errors were reported or are pending, and all have ended."""
         if self._delayed_since != NEVER:
             return
-        last_is_error = self._is_last_an_error
+        is_error_last = self._is_last_an_error
         if self._pending:
             condition, _ = self._pending[-1]
-            last_is_error = condition is not None
-        if last_is_error and self._is_open and not self._active:
+            is_error_last = condition is not None
+        if is_error_last and self._is_open and not self._active:
             self._report(None)
             self._send_pending(now)
 

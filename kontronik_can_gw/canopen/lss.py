@@ -176,7 +176,8 @@ class LssSlave:
     def __init__(self, host: Identity, send: Callable[[bytes], None]) -> None:
         self._host = host
         self._send = send
-        self._is_configuring = False
+        self.is_configuring = False
+        """True in the LSS configuration state, False in the waiting state."""
         self._expected = 0
         """Command specifier that continues the present selection or identification, else 0."""
         self._scanned: int | None = None
@@ -184,17 +185,12 @@ class LssSlave:
         self._stores: deque[bool] = deque()
         """For each pending save, oldest first: True if the master still waits for the answer."""
 
-    @property
-    def configuring(self) -> bool:
-        """True in the LSS configuration state, False in the waiting state."""
-        return self._is_configuring
-
     def reset(self) -> None:
         """Return to the waiting state at an NMT reset.
 
         Unfinished selections and scans are forgotten. Results of pending saves are not sent.
         """
-        self._enter(configuring=False)
+        self._enter(is_configuring=False)
 
     def receive(self, data: bytes, now: int) -> None:
         """Serve a data frame of 7E5h.
@@ -216,43 +212,43 @@ class LssSlave:
         elif service == Service.IDENTIFY_NON_CONFIGURED:
             if self._is_unconfigured:
                 self._answer(Service.NON_CONFIGURED)
-        elif self._is_configuring:
+        elif self.is_configuring:
             self._configure(service, data)
         elif service in _SELECT:
             own = self._host.identity[service - _SELECT[0]]
             if self._completes(_SELECT, service, expected, own == number):
-                self._enter(configuring=True)
+                self._enter(is_configuring=True)
                 self._answer(Service.SELECTED)
         elif service == Service.FASTSCAN and self._is_unconfigured:
             self._fastscan(number, *data[5:])
 
-    def stored(self, ok: bool) -> None:
+    def stored(self, is_stored: bool) -> None:
         """Answer with the result of the oldest pending save.
 
         Nothing is sent if the slave left the configuration state in the meantime, because another
         slave may be selected now.
         """
         if self._stores and self._stores.popleft():
-            self._answer(Service.STORE, OK if ok else STORE_FAILED)
+            self._answer(Service.STORE, OK if is_stored else STORE_FAILED)
 
     @property
     def _is_unconfigured(self) -> bool:
         host = self._host
         return host.active_node_id == UNCONFIGURED and host.pending_node_id == UNCONFIGURED
 
-    def _enter(self, configuring: bool) -> None:
-        self._is_configuring = configuring
+    def _enter(self, is_configuring: bool) -> None:
+        self.is_configuring = is_configuring
         self._expected = 0
         self._scanned = None
-        if not configuring:
+        if not is_configuring:
             self._stores = deque(False for _ in self._stores)
 
     def _switch_global(self, mode: int, now: int) -> None:
         if mode == 1:
-            self._enter(configuring=True)
+            self._enter(is_configuring=True)
         elif mode == 0:
-            was_configuring = self._is_configuring
-            self._enter(configuring=False)
+            was_configuring = self.is_configuring
+            self._enter(is_configuring=False)
             if was_configuring:
                 self._host.lss_left_configuration(now)
 
@@ -304,7 +300,7 @@ class LssSlave:
         self._scanned = following
         # LSSNext < LSSSub with every bit checked: the master has finished the last part
         if bit_checked == 0 and following < sub:
-            self._enter(configuring=True)
+            self._enter(is_configuring=True)
         self._answer(Service.IDENTIFIED)
 
     def _configure(self, service: int, data: bytes) -> None:

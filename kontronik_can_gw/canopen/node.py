@@ -158,14 +158,15 @@ class Node:
         name = f"CANopen node {self.node_id}"
         yield Use(self.sync.cob_id, "SYNC", SYNC)
         yield Use(SDO_REQUEST + self.node_id, f"SDO requests to {name}")
-        yield Use(HEARTBEAT + self.node_id, f"the heartbeat of {name}", own=True)
-        yield Use(SDO_ANSWER + self.node_id, f"SDO responses of {name}", own=True)
+        yield Use(HEARTBEAT + self.node_id, f"the heartbeat of {name}", is_own=True)
+        yield Use(SDO_ANSWER + self.node_id, f"SDO responses of {name}", is_own=True)
         emergencies = self.emergencies
-        if not emergencies.cob_id & INVALID_BIT:
-            yield Use(emergencies.cob_id & 0x7FF, f"emergencies of {name}", emergencies, own=True)
+        cob_id = emergencies.cob_id
+        if not cob_id & INVALID_BIT:
+            yield Use(cob_id & 0x7FF, f"emergencies of {name}", emergencies, is_own=True)
         for tpdo in self.tpdos:
-            if tpdo.valid:
-                yield Use(tpdo.cob_id, f"TPDO {tpdo.number + 1} of {name}", tpdo, own=True)
+            if tpdo.is_valid:
+                yield Use(tpdo.cob_id, f"TPDO {tpdo.number + 1} of {name}", tpdo, is_own=True)
 
     def routes(self) -> Iterator[tuple[int, FrameTaker]]:
         """Yield the COB-IDs that the node receives, each with the function that takes its frames.
@@ -255,12 +256,9 @@ class Node:
         self.due = min(self.due, self.emergencies.due)
 
     def advance(self, now: int) -> None:
-        """Let time pass."""
-        if now < self.due:
-            return
+        """Let time pass until ``now``, which is ``due`` or later."""
         for timer in self._timers:
             timer.advance(now)
-        self.set_due()
 
     def saved(self, error: str | None, now: int) -> None:
         """Follow the end of the oldest save. ``error`` is the reason if it failed."""
@@ -330,18 +328,18 @@ class Node:
     def _watch_changed(
         self,
         node_id: int,
-        lost: bool,
+        is_lost: bool,
         now: int,
         at: int,
     ) -> None:
         """Report that a watched heartbeat is missing since ``at``, or is back."""
-        self.emergencies.set(GatewayError.HEARTBEAT_LOST, lost, now, node_id, at)
-        if lost:
+        self.emergencies.set(GatewayError.HEARTBEAT_LOST, is_lost, now, node_id, at)
+        if is_lost:
             self.nmt.behave(1, now)
 
-    def _on_download(self, variable: Variable, changed: bool, now: int) -> None:
+    def _on_download(self, variable: Variable, has_changed: bool, now: int) -> None:
         for tpdo in self.tpdos:
             tpdo.on_download(variable, now)
-        self.parameters.on_download(variable, changed)
+        self.parameters.on_download(variable, has_changed)
         if variable.entry.index in _WITH_COB_ID:
             self._host.note_change()

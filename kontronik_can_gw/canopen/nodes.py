@@ -221,7 +221,7 @@ class Nodes(NodeOutput):
         owners = {}
         for index, node in enumerate(self.nodes):
             for use in node.uses():
-                if use.own:
+                if use.is_own:
                     owners[use.cob_id] = Owner(index, use.what)
         return owners
 

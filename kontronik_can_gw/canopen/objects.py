@@ -20,8 +20,6 @@ from kontronik_can_gw.esc.values import (
     Kind,
     Value,
     scaled,
-    steps,
-    steps_of,
     values_of,
 )
 from kontronik_can_gw.status import GatewayState, GatewayStatus
@@ -65,35 +63,15 @@ class Bound:
         """Steps of the object per step of the value."""
         return self.steps / self.source.per_unit
 
-    def read(
-        self,
-        esc: EscTelemetry,
-        gateway: GatewayStatus,
-        now: int,
-        high: int,
-    ) -> int | None:
-        """Return the number that the object shows now. None if the value is not available.
+    def shown(self, esc: EscTelemetry, count: int | None, high: int) -> int | None:
+        """Return the number that the object shows of these steps of the value. None if unknown.
 
         A counter restarts at 0 after ``high``.
         """
-        value = steps(self.source, esc, gateway, now)
-        return self._shown(esc, value, high)
-
-    def last(self, esc: EscTelemetry, high: int) -> int | None:
-        """Return the number that the object shows of the last live data, fresh or not."""
-        value = steps_of(self.source, esc, esc.last_live)
-        return self._shown(esc, value, high)
-
-    def _shown(
-        self,
-        esc: EscTelemetry,
-        value: int | None,
-        high: int,
-    ) -> int | None:
-        shown = scaled(self.source, esc, value, self.slope)
-        if shown is not None and self.source.rolls:
-            return shown % (high + 1)
-        return shown
+        number = scaled(self.source, esc, count, self.slope)
+        if number is not None and self.source.rolls:
+            return number % (high + 1)
+        return number
 
 
 def _counter(

@@ -81,10 +81,10 @@ class SyncTransmission:
         self._waiting = 0
         self.due = NEVER
 
-    def on_sync(self, counter: int, now: int, answer: bool) -> None:
+    def on_sync(self, counter: int, now: int, is_answered: bool) -> None:
         """Count a SYNC, and send the PDO if it is due.
 
-        ``counter`` is 0 if the SYNC has none. Without ``answer`` the SYNC is only counted.
+        ``counter`` is 0 if the SYNC has none. Without ``is_answered`` the SYNC is only counted.
         """
         if self._type > LAST_SYNC_TYPE:
             return
@@ -93,13 +93,13 @@ class SyncTransmission:
                 return
             self._has_begun = True  # this SYNC counts as the first
         if self._type == 0:
-            if self._slot.is_news and answer:
+            if self._slot.is_news and is_answered:
                 self._slot.send(now)
             return
         self._count += 1
         if self._count >= self._type:
             self._count = 0
-            if answer:
+            if is_answered:
                 self._send(now)
 
     def advance(self, now: int) -> None:
@@ -173,7 +173,7 @@ class Tpdo:
     ) -> None:
         self.number = number
         self.cob_id = 0
-        self.valid = False
+        self.is_valid = False
         self.type = 255
         """Transmission type."""
         self.inhibit_ns = 0
@@ -211,7 +211,7 @@ class Tpdo:
         return self._slot.sent
 
     @property
-    def on_change(self) -> bool:
+    def is_sent_on_change(self) -> bool:
         """True if the PDO is sent when a status object changes."""
         return self._plan is not None and self._plan.watched != 0
 
@@ -221,12 +221,12 @@ class Tpdo:
         Frames caused by changes of a status object are counted only with ``is_worst``, which means
         that these objects change all the time.
         """
-        if self._plan is None or not self.valid:
+        if self._plan is None or not self.is_valid:
             return 0.0
         if self.type not in EVENT_TYPES:
             return 10.0 / max(1, self.type)
         cycle = SECOND / self.event_ns if self.event_ns else 0.0
-        if self.on_change and not is_worst:
+        if self.is_sent_on_change and not is_worst:
             return cycle or 1.0
         events = EXPECTED_LIVE_HZ if self._plan.triggers & Event.LIVE else 1.0
         if self.inhibit_ns:
@@ -241,7 +241,7 @@ class Tpdo:
         index = self.communication_index
         cob_id = number(index, COB_ID)
         self.cob_id = cob_id & 0x7FF
-        self.valid = not cob_id & INVALID_BIT
+        self.is_valid = not cob_id & INVALID_BIT
         self.type = number(index, TYPE)
         self.inhibit_ns = number(index, INHIBIT) * MS // 10
         self.event_ns = number(index, EVENT_TIMER) * MS
@@ -263,7 +263,7 @@ class Tpdo:
         self.read()
         self._plan = compile_pdo(self.mapped) if self.mapped else None
         settings = None
-        if self.valid and self._plan is not None:
+        if self.is_valid and self._plan is not None:
             by_event = self.type in EVENT_TYPES
             settings = SlotSettings(
                 plan=self._plan,
@@ -294,7 +294,7 @@ class Tpdo:
             try:
                 self.check()
             except SdoAbort:
-                if cob_id is not None and self.valid:
+                if cob_id is not None and self.is_valid:
                     cob_id.value = int(cob_id.value) | INVALID_BIT
                     rejected.append(key(self.communication_index, COB_ID))
         self.configure(now)
@@ -317,7 +317,7 @@ class Tpdo:
         sub = mapping >> 8 & 0xFF
         bits = mapping & 0xFF
         variable = self._dictionary.find(index, sub)
-        is_mappable = variable.entry.mappable and variable.readable
+        is_mappable = variable.entry.is_mappable and variable.is_readable
         size = bits_of(variable)
         if not is_mappable or not size or size != bits:
             raise SdoAbort(Abort.NOT_MAPPABLE)
@@ -331,7 +331,7 @@ class Tpdo:
         """
         if not value & INVALID_BIT:
             is_other_id = value & 0x7FF != self.cob_id
-            if not self.mapped or (self.valid and is_other_id):
+            if not self.mapped or (self.is_valid and is_other_id):
                 raise SdoAbort(Abort.VALUE)
         self._check_id(value)
 
@@ -344,7 +344,7 @@ class Tpdo:
 
     def _check_while_invalid(self, _value: int) -> None:
         """SdoAbort 06090030h for a new inhibit time or SYNC start value while the PDO is valid."""
-        if self.valid:
+        if self.is_valid:
             raise SdoAbort(Abort.VALUE)
 
     def _check_sync_start(self, value: int) -> None:
@@ -359,7 +359,7 @@ class Tpdo:
         SdoAbort 06010000h while the PDO is valid, 06040042h if there are not so many entries or
         if they have more than 64 bits, 06040041h for an object that cannot be mapped.
         """
-        if self.valid:
+        if self.is_valid:
             raise SdoAbort(Abort.UNSUPPORTED_ACCESS)
         if self._dictionary.get(self.mapping_index, count) is None:
             raise SdoAbort(Abort.PDO_LENGTH)
@@ -367,7 +367,7 @@ class Tpdo:
 
     def _check_entry(self, mapping: int) -> None:
         """SdoAbort 06010000h for a new 1A0xh:1..8 unless the PDO is invalid and 1A0xh:0 is 0."""
-        if self.valid or self._dictionary.number(self.mapping_index):
+        if self.is_valid or self._dictionary.number(self.mapping_index):
             raise SdoAbort(Abort.UNSUPPORTED_ACCESS)
         if mapping:
             self.resolve(mapping)
@@ -376,7 +376,7 @@ class Tpdo:
 
     @property
     def _is_running(self) -> bool:
-        return self._is_started and self.valid and self._plan is not None
+        return self._is_started and self.is_valid and self._plan is not None
 
     def start(self, now: int) -> None:
         """Start because the node is OPERATIONAL. Event-driven PDOs send their values once."""
@@ -397,13 +397,13 @@ class Tpdo:
 
     def repeat(self, now: int) -> None:
         """Send the PDO again if it is sent on changes only."""
-        if self.on_change:
+        if self.is_sent_on_change:
             self._slot.news(now)
 
-    def on_sync(self, counter: int, now: int, answer: bool) -> None:
+    def on_sync(self, counter: int, now: int, is_answered: bool) -> None:
         """Count a SYNC, see ``SyncTransmission.on_sync``."""
         if self._is_running:
-            self.sync.on_sync(counter, now, answer)
+            self.sync.on_sync(counter, now, is_answered)
 
 
 def _check_length(mapped: Sequence[Variable]) -> None:
@@ -460,7 +460,7 @@ class Tpdos(list[Tpdo]):
     def release_ids(self) -> None:
         """Make all COB-IDs of PDOs available to others."""
         for tpdo in self:
-            tpdo.valid = False
+            tpdo.is_valid = False
 
     def stop(self) -> None:
         """Stop all PDOs, because the node has left OPERATIONAL."""
@@ -469,9 +469,9 @@ class Tpdos(list[Tpdo]):
 
     def on_sync(self, counter: int, now: int, at: int) -> None:
         """Count a SYNC that arrived ``at``. A SYNC from before a hold-up is not answered."""
-        answer = at > self._held_up_ns
+        is_answered = at > self._held_up_ns
         for tpdo in self:
-            tpdo.on_sync(counter, now, answer)
+            tpdo.on_sync(counter, now, is_answered)
             self.due = min(self.due, tpdo.sync.due)
 
     def advance(self, now: int) -> None:

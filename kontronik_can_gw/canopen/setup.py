@@ -220,7 +220,7 @@ class CanopenSetup(OutputSetup):
                 users.setdefault(use.cob_id, []).append((number, use))
         clashing: set[int] = set()
         for cob_id, users_of_id in users.items():
-            is_shared = len(users_of_id) > 1 and any(use.own for _, use in users_of_id)
+            is_shared = len(users_of_id) > 1 and any(use.is_own for _, use in users_of_id)
             if is_shared or cob_id in message_ids:
                 clashing.update(dict(users_of_id))
         clashing.update(
@@ -239,7 +239,7 @@ class CanopenSetup(OutputSetup):
         found = []
         nodes = self.nodes(escs).nodes
         for node, esc in zip(nodes, escs, strict=True):
-            tpdos = sum(tpdo.valid for tpdo in node.tpdos)
+            tpdos = sum(tpdo.is_valid for tpdo in node.tpdos)
             plural = "" if tpdos == 1 else "s"
             words = f"node {node.node_id}, {tpdos} TPDO{plural}"
             if node.node_id == UNCONFIGURED:

@@ -220,9 +220,9 @@ class Parameters:
 
     # --- changes
 
-    def on_download(self, variable: Variable, changed: bool) -> None:
+    def on_download(self, variable: Variable, has_changed: bool) -> None:
         """Clear 1020h if a parameter was changed over the bus."""
-        if changed and variable.entry.index not in _NO_CONFIGURATION:
+        if has_changed and variable.entry.index not in _NO_CONFIGURATION:
             self._configuration_changed()
 
     def store_node_id(self) -> bool:
@@ -233,13 +233,13 @@ class Parameters:
             return False
         return True
 
-    def saved(self, ok: bool) -> int | None:
+    def saved(self, is_saved: bool) -> int | None:
         """Note that the oldest pending save reached the disk, or failed.
 
         Returns its ticket of the SDO server, or None for LSS.
         """
         ticket, stored = self._pending.popleft()
-        if ok:
+        if is_saved:
             self._stored = stored
         elif not self._pending:
             self._wanted = self._stored

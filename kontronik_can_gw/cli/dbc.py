@@ -123,7 +123,7 @@ def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> s
             str(file),
             escs,
             settings,
-            fd_allowed=True,
+            is_fd_allowed=True,
         )
         for line in (*ignored, *layout.warnings):
             say(f"warning: {line}")

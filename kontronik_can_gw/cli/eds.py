@@ -112,7 +112,7 @@ def _active_values(node: Node) -> dict[tuple[int, int], Value]:
         entry = variable.entry
         key = (entry.index, entry.sub)
         is_configuration = key not in BINDINGS and entry.index not in _STATES_AND_COMMANDS
-        if not variable.readable or not is_configuration:
+        if not variable.is_readable or not is_configuration:
             continue
         try:
             values[key] = node.dictionary.value(variable, 0)

@@ -55,8 +55,8 @@ def examine(path: Path) -> tuple[Config | None, list[str]]:
     try:
         text = path.read_bytes().decode("utf-8-sig")  # editors on Windows write a byte order mark
     except OSError as error:
-        missing = isinstance(error, FileNotFoundError)
-        advice = " `kontronik-can-gw init` writes an example." if missing else ""
+        is_missing = isinstance(error, FileNotFoundError)
+        advice = " `kontronik-can-gw init` writes an example." if is_missing else ""
         raise UserError(f"{path}: cannot be read: {error.strerror}.{advice}") from None
     except UnicodeDecodeError:
         raise UserError(

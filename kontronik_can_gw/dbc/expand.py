@@ -1,7 +1,7 @@
 """Copies a one-ESC DBC for several ESCs without loss: names get prefixes, ids are moved."""
 
 import fnmatch
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from kontronik_can_gw.config.output_keys import DbcConfig
@@ -40,22 +40,16 @@ def copies_of(
     copied: set[int] = set()
     if len(escs) > 1:
         copied = _messages_of_each(ours, Binder(escs, settings.bind))
-    ids = []
-    for message in messages:
-        can_id = message.frame_id
-        if node in message.senders:
-            can_id += shift
-        ids.append((can_id, message.is_extended_frame, id(message) in copied))
-    step = _step(ids, len(escs), settings.id_step, file) if copied else 0
+    moved = [Copy(message, shift if node in message.senders else 0) for message in messages]
+    step = _step(moved, copied, len(escs), settings.id_step, file) if copied else 0
     copies = []
-    for message in messages:
-        distance = shift if node in message.senders else 0
-        if id(message) not in copied:
-            copies.append(Copy(message, distance))
+    for copy in moved:
+        if id(copy.message) not in copied:
+            copies.append(copy)
             continue
         for index, esc in enumerate(escs):
-            prefix = esc_prefix(esc.name)
-            copies.append(Copy(message, distance + index * step, index, prefix))
+            distance = copy.distance + index * step
+            copies.append(Copy(copy.message, distance, index, esc_prefix(esc.name)))
     problems = [f"{file}: {problem}" for problem in _problems(copies, node, settings)]
     if problems:
         raise UserError(*problems)
@@ -156,25 +150,26 @@ def _problems(copies: Sequence[Copy], node: str, settings: DbcConfig) -> Iterato
 
 
 def _step(
-    ids: Sequence[tuple[int, bool, bool]],
+    messages: Sequence[Copy],
+    copied: Container[int],
     count: int,
     wanted: int | None,
     file: str,
 ) -> int:
     """Return the distance of the ids of adjacent ESCs.
 
-    This is ``wanted``, or the smallest distance without a clash. ``ids`` contains for each message
-    its id, True if the id has 29 bits, and True if the message is copied for each ESC.
+    This is ``wanted``, or the smallest distance without a clash. ``copied`` contains the object ids
+    of the messages that are copied for each of ``count`` ESCs.
     """
-    taken = {(can_id, extended) for can_id, extended, is_copied in ids if not is_copied}
-    own = [(can_id, extended) for can_id, extended, is_copied in ids if is_copied]
-    widest = max(ids)[0] - min(ids)[0] + 1
-    steps = range(1, widest + 1) if wanted is None else [wanted]
+    taken = {copy.key for copy in messages if id(copy.message) not in copied}
+    own = [copy.key for copy in messages if id(copy.message) in copied]
+    ids = [copy.frame_id for copy in messages]
+    steps = range(1, max(ids) - min(ids) + 2) if wanted is None else [wanted]
     for step in steps:
-        moved: set[tuple[int, bool]] = set()
+        moved: set[int] = set()
         for index in range(count):
-            moved.update((can_id + index * step, extended) for can_id, extended in own)
-        if len(moved) == len(own) * count and not taken & moved:
+            moved.update(key + index * step for key in own)
+        if len(taken | moved) == len(taken) + len(own) * count:
             return step
     if wanted is not None:
         raise UserError(

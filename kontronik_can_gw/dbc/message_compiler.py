@@ -79,7 +79,7 @@ def _is_fd(message: "Message") -> bool:
 
 
 def _frame_problems(job: Compilation, message: "Message") -> Iterator[str]:
-    if _is_fd(message) and not job.fd_allowed:
+    if _is_fd(message) and not job.is_fd_allowed:
         yield (
             f"{message.name}: is a CAN FD message ({message.length} bytes). "
             "Set can.fd = true, or shorten it."

@@ -47,7 +47,7 @@ def prepare(
     file: str,
     escs: Sequence[EscSettings],
     settings: DbcConfig,
-    fd_allowed: bool = False,
+    is_fd_allowed: bool = False,
     taken_ids: Mapping[int, str] | None = None,
 ) -> MessageLayout:
     """Return the compiled layout of a gateway with these ESCs.
@@ -58,7 +58,7 @@ def prepare(
     node = choose_node(database, settings.node, file, settings.messages)
     copies = copies_of(database, file, escs, settings)
     ours = [copy for copy in copies if node in copy.message.senders]
-    job = Compilation(database, settings, Binder(escs, settings.bind), fd_allowed)
+    job = Compilation(database, settings, Binder(escs, settings.bind), is_fd_allowed)
     job.problems += own_left_out(database, node, file, settings.messages)
     plans = [*_compiled(job, ours)]
     job.problems += _clashes(copies, node, taken_ids or {})
@@ -252,10 +252,9 @@ def reporter(message: MessagePlan, flag: SignalPlan) -> SignalPlan | None:
     return None
 
 
-def unreported(settings: CoreSettings) -> list[str]:
-    """Return a warning for each message whose flags hide the loss of telemetry."""
+def unreported(settings: CoreSettings) -> Iterator[str]:
+    """Yield a warning for each message whose flags hide the loss of telemetry."""
     layout = settings.layout
-    found = []
     for message in layout.messages:
         flags = []
         for signal in message.signals:
@@ -263,36 +262,32 @@ def unreported(settings: CoreSettings) -> list[str]:
                 flags.append(signal.name)
         if flags and not (settings.silent_on_loss and message.can_stop):
             remedy = ', or set dbc.on_loss = "silent"' if message.can_stop else ""
-            found.append(
+            yield (
                 f"{layout.file}: {message.name}: without telemetry {listed(flags, 3)} are sent "
                 "as if they were known, and no signal "
                 "of the message reports the loss. Add a signal bound to link_state, or one with "
                 f"NotAvailable in its value table{remedy}."
             )
-    return found
 
 
-def without_quiet(settings: CoreSettings) -> list[str]:
-    """Return a warning for each signal that cannot report quiet mode, if this mode can begin."""
+def without_quiet(settings: CoreSettings) -> Iterator[str]:
+    """Yield a warning for each signal that cannot report quiet mode, if this mode can begin."""
     layout = settings.layout
     messages = layout.messages if settings.quiet_after_ns else ()
-    found = []
     for message in messages:
         for signal in message.signals:
             numbers = signal.numbers
             is_state = signal.source is VALUES["gateway_state"]
             if is_state and numbers is not None and GatewayState.QUIET not in numbers:
-                found.append(
+                yield (
                     f"{layout.file}: {message.name}.{signal.name}: "
                     "its value table has no Quiet, so quiet mode is sent as Error. Add it."
                 )
-    return found
 
 
-def unsupplied(settings: CoreSettings) -> list[str]:
-    """Return a warning for each message with values that its ESC's protocol does not have."""
+def unsupplied(settings: CoreSettings) -> Iterator[str]:
+    """Yield a warning for each message with values that its ESC's protocol does not have."""
     layout = settings.layout
-    found = []
     for message in layout.messages:
         names = []
         protocols = set()
@@ -301,10 +296,9 @@ def unsupplied(settings: CoreSettings) -> list[str]:
                 names.append(signal.name)
                 protocols.add(settings.escs[signal.esc or 0].protocol)
         if names:
-            found.append(
+            yield (
                 f"{layout.file}: {message.name}: {listed(names, 3)}: "
                 f"never available, because the protocol {' or '.join(sorted(protocols))} "
                 "does not supply them. "
                 "A flag has no code for this: it is sent as 0 or its start value."
             )
-    return found

@@ -37,7 +37,7 @@ class Compilation:
     database: "Database"
     settings: DbcConfig
     binder: Binder
-    fd_allowed: bool
+    is_fd_allowed: bool
     problems: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     """They begin with the name of the message, and get the file's name later."""
@@ -70,7 +70,7 @@ class SignalCompiler:
             self.nibble = protection.nibble
         self.table = ValueTable(signal)
         self.start = attribute(signal, "GenSigStartValue", job.database)
-        self.start_is_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
+        self.is_start_set = signal.dbc is not None and "GenSigStartValue" in signal.dbc.attributes
         self.start_raw = None
         """Raw bits of the start value. None if the signal cannot contain it."""
         if isinstance(self.start, (int, float)):
@@ -185,7 +185,7 @@ class SignalCompiler:
         if self.table.not_available is not None:
             return self.table.not_available
         # a default start value does not mean "not available", but a flag has no other code
-        if self.start_raw is not None and (self.start_is_set or self.signal.length == 1):
+        if self.start_raw is not None and (self.is_start_set or self.signal.length == 1):
             return self.start_raw
         low, high = raw_range(self.signal)
         return low if self.signal.is_signed else high
@@ -247,7 +247,7 @@ class SignalCompiler:
         if role is not None:
             return replace(plan, role=role)
         if bound is None and self.job.settings.unbound == "start_value":
-            return replace(plan, constant=self._start_value(plan), unbound=True)
+            return replace(plan, constant=self._start_value(plan), is_unbound=True)
         raise UnfitSignal(self._without_meaning(name, bound is not None))
 
     def _without_meaning(self, name: str, is_bound: bool) -> str:
@@ -313,7 +313,7 @@ class SignalCompiler:
 
         They are its own start value, otherwise NotAvailable, and otherwise the default or 0.
         """
-        if not self.start_is_set and self.table.not_available is not None:
+        if not self.is_start_set and self.table.not_available is not None:
             return plan.not_available
         if not self.start:
             return 0
@@ -333,7 +333,7 @@ class SignalCompiler:
         chosen = self.job.settings.flags_on_loss
         if chosen is not None:
             return chosen
-        has_start_value = self.start_is_set and self.start_raw is not None
+        has_start_value = self.is_start_set and self.start_raw is not None
         return None if has_start_value else 0
 
 
@@ -365,8 +365,8 @@ def _bound_plan(
     if value.bit is not None and plan.length == 1:
         plan = _flag(plan, on_loss)
     elif value.rolls:
-        counts = slope == 1 and intercept == 0 and low == 0 and high >= 1
-        if plan.is_float or not counts:
+        is_counter = slope == 1 and intercept == 0 and low == 0 and high >= 1
+        if plan.is_float or not is_counter:
             raise UnfitSignal(
                 f"{value.name} is a counter, which needs factor 1, offset 0 and a minimum of 0. "
                 "Correct them."

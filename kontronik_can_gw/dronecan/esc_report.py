@@ -348,10 +348,10 @@ class EscReport:
         onsets = self._onsets
         word = self.word
         if self.esc.up:
-            turns = bool(steps_of(self._speed, self.esc, self.esc.live))
-            if turns and not self._is_turning:
+            is_turning = bool(steps_of(self._speed, self.esc, self.esc.live))
+            if is_turning and not self._is_turning:
                 self._onsets = 0  # the motor was started
-            self._is_turning = turns
+            self._is_turning = is_turning
         if not events & Event.LINK:
             self._onsets += (word & ~self._before & self._errors).bit_count()
         self._before = word

@@ -16,7 +16,7 @@ from kontronik_can_gw.dronecan.wire import NODE, REQUEST, SERVICE, Assembler, Da
 from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.frames import CanFrame, id_block
 from kontronik_can_gw.signals.transfer import TRANSFER_ID, transfer
-from kontronik_can_gw.status import CanState
+from kontronik_can_gw.status import CanState, GatewayStatus
 from kontronik_can_gw.times import NEVER, SECOND
 
 _ANSWERED = (wire.GET_NODE_INFO, wire.RESTART_NODE, wire.GET_SET)
@@ -65,6 +65,7 @@ class DronecanNode:
         self,
         setup: DronecanNodeSetup,
         given: Given,
+        gateway: GatewayStatus,
         reports: Sequence[EscReport],
     ) -> None:
         self.setup = setup
@@ -73,6 +74,7 @@ class DronecanNode:
         self.reports = [reports[number] for number in setup.escs]
         self.is_duplicate = False
         """True if another device sends with this node-ID."""
+        self._gateway = gateway
         self._table = given.table
         self._version = given.version
         self._transfer_ids: dict[int, int] = {}
@@ -95,20 +97,22 @@ class DronecanNode:
         can_id = wire.message_id(kind.number, self.node_id, priority)
         return transfer(can_id, kind.seed, payload, count, queued)
 
-    def status(self, uptime_s: int, mode: int, bus_is_well: bool) -> bytes:
+    def status(self, now: int, mode: int = wire.OPERATIONAL) -> bytes:
         """Return the payload of NodeStatus.
 
         The health of the ESCs is included only if the user has chosen it, because an autopilot does
         not arm while the health of a node is not OK.
         """
+        gateway = self._gateway
         health = wire.OK
-        if self.is_duplicate or not bus_is_well:
+        if self.is_duplicate or gateway.can_state in (CanState.ERROR_PASSIVE, CanState.BUS_OFF):
             health = wire.WARNING
         code = 0
         for report in self.reports:
             code |= report.word
             if self._table.health == "esc":
                 health = max(health, report.health)
+        uptime_s = (now - gateway.started_ns) // SECOND
         state = health << 6 | mode << 3
         return wire.NODE_STATUS.pack(uptime_s & 0xFFFFFFFF, state, code & 0xFFFF)
 
@@ -118,14 +122,15 @@ class DronecanNode:
         kind: DataType,
         request: bytes,
         transfer_id: int,
-        status: bytes,
+        now: int,
     ) -> list[CanFrame]:
         """Return the frames of the response to a request. Empty if the request is malformed.
 
-        ``request_id`` is the CAN id of the request, and ``status`` the node's present NodeStatus.
+        ``request_id`` is the CAN id of the request.
         """
         if kind is wire.GET_NODE_INFO:
             setup = self.setup
+            status = self.status(now)
             software = (*self._version, 0, 0, 0)
             answer = wire.GET_NODE_INFO.pack(status, *software, *_HARDWARE, setup.unique_id, 0)
             answer += setup.name.encode("ascii")
@@ -207,7 +212,6 @@ class Dronecan(Output):
         host: OutputHost,
     ) -> None:
         super().__init__()
-        self._gateway = host.status
         table = given.table
         self._table = table
         self._reports = []
@@ -215,7 +219,7 @@ class Dronecan(Output):
             report = EscReport(esc, table.first_index + number, table)
             report.take_slots(partial(host.slot, number))
             self._reports.append(report)
-        self._nodes = [DronecanNode(setup, given, self._reports) for setup in setups]
+        self._nodes = [DronecanNode(setup, given, host.status, self._reports) for setup in setups]
         self._by_id: dict[int, DronecanNode] = {}
         """The nodes that have a node-ID."""
         self._allocation = Allocation(given.seed)
@@ -265,8 +269,7 @@ class Dronecan(Output):
 
     def first_frame(self, now: int) -> CanFrame | None:
         for node in self._by_id.values():
-            status = self._status_of(node, now)
-            return node.message(wire.NODE_STATUS, status, priority=wire.LOWEST)[0]
+            return node.message(wire.NODE_STATUS, node.status(now), priority=wire.LOWEST)[0]
         return None
 
     def repeat_measurements(self, now: int) -> None:
@@ -369,8 +372,7 @@ class Dronecan(Output):
             self._unanswered += 1
             return
         transfer_id = frame.data[-1] & TRANSFER_ID
-        status = self._status_of(node, now)
-        answer = node.answer(frame.can_id, kind, request, transfer_id, status)
+        answer = node.answer(frame.can_id, kind, request, transfer_id, now)
         if answer:
             self._answers += 1
             self._answered += 1
@@ -383,7 +385,7 @@ class Dronecan(Output):
         for report in self._reports:
             report.update(0, now)
         for node in self._by_id.values():
-            self._send_node_status(node, now)
+            self._send_node_status(node, now, wire.OPERATIONAL)
             if not self._table.log_messages:
                 continue
             for report in node.reports:
@@ -398,25 +400,9 @@ class Dronecan(Output):
         for node in self._by_id.values():
             self._send_node_status(node, now, wire.OFFLINE)
 
-    def _send_node_status(
-        self,
-        node: DronecanNode,
-        now: int,
-        mode: int = wire.OPERATIONAL,
-    ) -> None:
-        status = self._status_of(node, now, mode)
+    def _send_node_status(self, node: DronecanNode, now: int, mode: int) -> None:
+        status = node.status(now, mode)
         self.frames += node.message(wire.NODE_STATUS, status, priority=wire.LOWEST)
-
-    def _status_of(
-        self,
-        node: DronecanNode,
-        now: int,
-        mode: int = wire.OPERATIONAL,
-    ) -> bytes:
-        gateway = self._gateway
-        bus_is_well = gateway.can_state not in (CanState.ERROR_PASSIVE, CanState.BUS_OFF)
-        uptime_s = (now - gateway.started_ns) // SECOND
-        return node.status(uptime_s, mode, bus_is_well)
 
     # --- node-IDs
 

@@ -106,7 +106,7 @@ class SignalPlan:
     """Texts of the value table by raw value, without the codes for not available and error."""
     notes: tuple[str, ...] = ()
     """For the user: lost resolution and range."""
-    unbound: bool = False
+    is_unbound: bool = False
     """True if the signal is a constant because it has no source."""
 
 

@@ -59,17 +59,17 @@ def default(
     index: int,
     sub: int,
     value: float | bytes,
-    relative: bool | None = None,
+    is_relative: bool | None = None,
 ) -> Changes:
     """Return the change of one default."""
-    if relative is None:
+    if is_relative is None:
         (entry,) = (e for e in shipped_eds().entries if (e.index, e.sub) == (index, sub))
-        relative = entry.relative
-    return {(index, sub): {"default": value, "relative": relative}}
+        is_relative = entry.is_relative
+    return {(index, sub): {"default": value, "is_relative": is_relative}}
 
 
 NO_HEARTBEAT = default(0x1017, 0, 0)
-NO_PDOS: Changes = {(0x1800 + n, 1): {"default": OFF, "relative": False} for n in range(6)}
+NO_PDOS: Changes = {(0x1800 + n, 1): {"default": OFF, "is_relative": False} for n in range(6)}
 SPARE: Changes = {
     (0x1A04, 0): {"default": 1},
     (0x1A04, 1): {"default": 0x20000210},
@@ -345,7 +345,7 @@ class Bench(Talker):
                 cob_ids = [f"{cob_id:03X}" for cob_id in sorted(self.output.receive_ids)]
                 return f"listens {' '.join(cob_ids)}"
             case "slave", _:
-                return f"slave {'configuration' if self.nodes[0].lss.configuring else 'waiting'}"
+                return f"slave {'configuration' if self.nodes[0].lss.is_configuring else 'waiting'}"
             case "node-id", _:
                 first = self.nodes[0]
                 return f"node-id {first.node_id} {first.identity.pending_node_id}"
@@ -467,7 +467,7 @@ def bench_of(options: Sequence[str]) -> Bench:
             case [place, *words] if re.fullmatch("[0-9A-F]{4}:[0-9A-F]{2}", place):
                 if words[0] == "=":
                     base = int(words[1].removeprefix("$NODEID+"), 16)
-                    change = {"default": base, "relative": words[1].startswith("$NODEID+")}
+                    change = {"default": base, "is_relative": words[1].startswith("$NODEID+")}
                 else:
                     pairs = (word.split("=") for word in words)
                     change = {key: _attribute(value) for key, value in pairs}
@@ -514,5 +514,5 @@ def tpdo(
     changes: dict[tuple[int, int], Any] = {}
     for place, value in values.items():
         changes[place] = {"default": value}
-    changes[index, 1] = {"default": 0x40000080 + 0x100 * number, "relative": True}
+    changes[index, 1] = {"default": 0x40000080 + 0x100 * number, "is_relative": True}
     return changes

@@ -126,7 +126,7 @@ def test_foreign_master_finds_slaves_by_fastscan_and_sets_node_ids() -> None:
         place = found[3] - 77
         assert ok
         assert tuple(found) == bench.nodes[place].identity.identity
-        assert [n for n, node in enumerate(bench.nodes) if node.lss.configuring] == [place]
+        assert [n for n, node in enumerate(bench.nodes) if node.lss.is_configuring] == [place]
         master.configure_node_id(number)
         assert master.inquire_lss_address(canopen.lss.CS_INQUIRE_SERIAL_NUMBER) == found[3]
         master.send_switch_state_global(master.WAITING_STATE)
@@ -140,7 +140,7 @@ def test_foreign_master_configures_and_stores_a_node_id() -> None:
     master = master_of(bench)
     identity = bench.nodes[1].identity.identity
     assert master.send_switch_state_selective(*identity)
-    assert [node.lss.configuring for node in bench.nodes] == [False, True, False]
+    assert [node.lss.is_configuring for node in bench.nodes] == [False, True, False]
     assert tuple(map(master.inquire_lss_address, range(0x5A, 0x5E))) == identity
     assert master.inquire_node_id() == UNCONFIGURED
     master.configure_node_id(0x2A)

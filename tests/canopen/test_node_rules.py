@@ -125,7 +125,7 @@ def test_each_mappable_object_can_be_sent_and_equals_its_sdo_value() -> None:
     bench.start()
     tried = 0
     for entry in shipped_eds().entries:
-        if not entry.mappable:
+        if not entry.is_mappable:
             continue
         data = bench.read(entry.index, entry.sub)
         assert isinstance(data, bytes)

@@ -88,7 +88,7 @@ def test_fields_are_in_wire_order_and_have_their_types(
         assert entry.name == expected
         assert entry.data_type == TYPE_OF_WIRE[row.wire], name
         assert entry.access == "ro"
-        assert entry.mappable
+        assert entry.is_mappable
         assert entry.low is None
         assert entry.high is None
         assert entry.default == 0
@@ -148,7 +148,7 @@ def as_bytes(value: object) -> object:
 
 def power_on(entry: EdsEntry, node_id: int) -> int | float | bytes | None:
     """Return the default of an entry for a node."""
-    return entry.default + node_id if entry.relative else entry.default  # type: ignore[operator]
+    return entry.default + node_id if entry.is_relative else entry.default  # type: ignore[operator]
 
 
 @pytest.mark.parametrize("node_id", [1, 127])
@@ -160,7 +160,7 @@ def test_canopen_library_reads_every_entry_like_our_reader(shipped: Eds, node_id
         theirs[v.index, v.subindex] = (*about, as_bytes(v.default))
     ours = {}
     for e in shipped.entries:
-        about = e.name, e.data_type, e.access, e.mappable, e.low, e.high
+        about = e.name, e.data_type, e.access, e.is_mappable, e.low, e.high
         ours[e.index, e.sub] = (*about, power_on(e, node_id))
     assert ours == theirs
     assert {index: dictionary[index].name for index in dictionary} == shipped.object_names
@@ -200,7 +200,7 @@ def test_dcfchk_finds_no_mistake_in_the_eds_and_in_its_dcf(
 
 def test_defaults_fit_their_limits_for_a_node_without_a_node_id(shipped: Eds) -> None:
     """Lely's dcf2c adds 255 for $NODEID in a file without a node, and warns of an overflow."""
-    relative = [entry for entry in shipped.entries if entry.relative]
+    relative = [entry for entry in shipped.entries if entry.is_relative]
     assert len(relative) > 5
     for entry in relative:
         assert isinstance(entry.default, int)

@@ -191,7 +191,7 @@ def test_values_of_every_type_are_read_from_an_eds_and_written_to_a_dcf(
     eds = reader.load(with_object(content).encode("ascii"), "mine.eds")
     entry = next(entry for entry in eds.entries if entry.index == 0x2200)
     shown = repr(entry.default)
-    if entry.relative:
+    if entry.is_relative:
         shown += " + node-ID"
     assert shown == read
     assert entry.default is not None
@@ -217,7 +217,7 @@ def test_signed_limits_and_keys_without_a_value_are_read() -> None:
         (0x06, EMPTY, (None, None, None)),
     ):
         entry = entry_2200(variable(data_type, **keys))
-        assert (entry.low, entry.high, entry.default, entry.mappable) == (*wanted, False)
+        assert (entry.low, entry.high, entry.default, entry.is_mappable) == (*wanted, False)
 
 
 # --- the DCF

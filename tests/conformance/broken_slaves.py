@@ -271,7 +271,7 @@ def _sends_tpdo(item: str, name: str, state: NmtState, is_valid: bool) -> None:
 
     def send_tpdo(frame: CanFrame, proxy: Proxy) -> list[CanFrame]:
         first = proxy.bench.nodes[0].tpdos[0]
-        if _state(proxy) is state and first.valid == is_valid:
+        if _state(proxy) is state and first.is_valid == is_valid:
             proxy.answer(_TPDO, bytes(8))
         return [frame]
 
@@ -354,7 +354,7 @@ def lss_is_ignored(frame: CanFrame, _proxy: Proxy) -> list[CanFrame]:
 
 @_request("lss-silent-while-waiting", _LSS_REQUEST, "5E")
 def lss_answers_while_waiting(frame: CanFrame, proxy: Proxy) -> list[CanFrame]:
-    if not proxy.bench.nodes[0].lss.configuring:
+    if not proxy.bench.nodes[0].lss.is_configuring:
         proxy.answer(_LSS_RESPONSE, bytes.fromhex("5E01000000000000"))
     return [frame]
 

@@ -41,7 +41,7 @@ def compiled(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> Me
     """Return the layout of a DBC for ESCs of these names. ``settings`` are fields of DbcConfig."""
     escs = [EscSettings(name, 7) for name in names]
     database = parse_database(text.encode(), FILE)
-    return prepare(database, FILE, escs, DbcConfig(**settings), fd_allowed=True)
+    return prepare(database, FILE, escs, DbcConfig(**settings), is_fd_allowed=True)
 
 
 def refused(text: str, names: Sequence[str] = ("esc1",), **settings: Any) -> list[str]:

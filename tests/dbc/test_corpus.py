@@ -173,7 +173,7 @@ def check_signal(
     raw: Any,
 ) -> None:
     if not isinstance(source, str):
-        if planned.unbound and planned.not_available != planned.constant:
+        if planned.is_unbound and planned.not_available != planned.constant:
             assert raw == (signal.raw_initial or 0)
         return
     converted = conversion(values.VALUES[source].unit, signal.unit or "")

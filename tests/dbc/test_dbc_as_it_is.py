@@ -242,7 +242,7 @@ def test_unbound_signal_has_its_start_value_as_cantools_reads_it() -> None:
     assert read == expected | {"Ratio": 1.5, "Cool": -2}
     shown: dict[str, str] = {}
     for plan in layout.messages:
-        shown |= {signal.name: held(signal) for signal in plan.signals if signal.unbound}
+        shown |= {signal.name: held(signal) for signal in plan.signals if signal.is_unbound}
     assert shown == {"Torque": "-512.5 Nm", "Warm": "15", "Ratio": "1.5", "Cool": "-2"}
     (once,) = [line for line in layout.warnings if "sent only once" in line]
     assert once.startswith("my_car.dbc: sent only once, at the start, ")
@@ -468,10 +468,10 @@ def test_layout_without_a_signal_that_reports_the_loss_causes_a_warning(
     found = reporter(message, flag)
     assert is_mute(flag)
     assert (found.name if found else None) == name
-    warned = unreported(CoreSettings((), layout))
+    warned = list(unreported(CoreSettings((), layout)))
     assert len(warned) == (name is None)
     assert all('on_loss = "silent"' in line and "Undervoltage" in line for line in warned)
-    assert not unreported(CoreSettings((), layout, silent_on_loss=True))
+    assert not list(unreported(CoreSettings((), layout, silent_on_loss=True)))
 
 
 def test_each_flag_needs_a_signal_of_its_own_esc_to_report_the_loss() -> None:

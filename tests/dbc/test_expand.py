@@ -272,8 +272,8 @@ def test_random_files_are_written_without_a_loss_and_give_the_same_plans(seed: i
     after = read(writer.copies_text(before))
     assert all_facts(after) == all_facts(before)
     bind = DbcConfig(bind=bindings(messages))
-    old = prepare(before, "x", PAIR, bind, fd_allowed=True)
-    new = prepare(after, "x", PAIR, bind, fd_allowed=True)
+    old = prepare(before, "x", PAIR, bind, is_fd_allowed=True)
+    new = prepare(after, "x", PAIR, bind, is_fd_allowed=True)
     assert plain_plans(new) == plain_plans(old)
 
 
@@ -293,8 +293,8 @@ def test_written_file_compiles_to_the_plans_that_are_sent(text: str, node: str) 
     ]
     settings = DbcConfig(node=node)
     written, _ = multiplied(text, three, node)
-    sent = prepare(read(text), "x", three, settings, fd_allowed=True)
-    again = prepare(written, "x", three, settings, fd_allowed=True)
+    sent = prepare(read(text), "x", three, settings, is_fd_allowed=True)
+    again = prepare(written, "x", three, settings, is_fd_allowed=True)
     assert any(plan.renamed for plan in sent.messages)
     plain = [replace(plan, compiled=plan.signals, renamed=None) for plan in sent.messages]
     assert plain_plans(replace(sent, messages=tuple(plain))) == plain_plans(again)

@@ -119,7 +119,7 @@ def layout(
     while True:
         try:
             text, chosen = dbc(chance, escs, most)
-            return prepare(read(text), "x.dbc", escs, chosen, fd_allowed=True)
+            return prepare(read(text), "x.dbc", escs, chosen, is_fd_allowed=True)
         except UserError:
             continue
 
@@ -339,7 +339,7 @@ def _mappable() -> list[Variable]:
     eds = load(shipped("eds/kontronik_esc.eds").read_bytes(), "kontronik_esc.eds")
     found = []
     for entry in eds.entries:
-        if entry.mappable and (entry.index, entry.sub) in BINDINGS:
+        if entry.is_mappable and (entry.index, entry.sub) in BINDINGS:
             found.append(Variable(entry))
             found[-1].bound = BINDINGS[entry.index, entry.sub]
     return found

@@ -109,7 +109,7 @@ def one(library: Any, seed: int) -> int:
     text = changed(chance, text)
     try:
         database = parse_database(text.encode("latin-1", "ignore"), "x.dbc")
-        layout = prepare(database, "x.dbc", escs, chosen, fd_allowed=True)
+        layout = prepare(database, "x.dbc", escs, chosen, is_fd_allowed=True)
         both = equality.Both(library, chance, escs, layout)
     except (UserError, NotInCore):
         return 0

@@ -82,7 +82,7 @@ def scaled(seed: int, digits: int) -> tuple[list[EscSettings], MessageLayout]:
         text = 'VERSION ""\nBU_: G X\nBO_ 256 M: 64 G\n' + "\n".join(lines) + "\n"
         database = parse_database(text.encode(), "scaled.dbc")
         try:
-            return escs, prepare(database, "s.dbc", escs, DbcConfig(bind=bind), fd_allowed=True)
+            return escs, prepare(database, "s.dbc", escs, DbcConfig(bind=bind), is_fd_allowed=True)
         except UserError:
             continue
 

@@ -52,7 +52,8 @@ BA_DEF_DEF_ "GenMsgCycleTime" 0;
 BA_ "GenMsgCycleTime" BO_ 256 10;
 '''
 escs = (EscSettings(),)
-layout = prepare(parse_database(DBC.encode(), "t.dbc"), "t.dbc", escs, DbcConfig(), fd_allowed=True)
+database = parse_database(DBC.encode(), "t.dbc")
+layout = prepare(database, "t.dbc", escs, DbcConfig(), is_fd_allowed=True)
 
 
 def stream(wire_layout):

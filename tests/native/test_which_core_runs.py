@@ -65,7 +65,7 @@ def layout_of(signal: str, more: str = "", length: int = 8) -> MessageLayout:
         "t.dbc",
         (EscSettings(),),
         DbcConfig(),
-        fd_allowed=True,
+        is_fd_allowed=True,
     )
 
 

@@ -28,7 +28,7 @@ from kontronik_can_gw.dronecan import wire
 from kontronik_can_gw.dronecan.esc_report import fill, plans_of
 from kontronik_can_gw.esc.protocols import PROTOCOLS
 from kontronik_can_gw.esc.telemetry import EscSettings
-from kontronik_can_gw.esc.values import Group
+from kontronik_can_gw.esc.values import Group, steps
 from kontronik_can_gw.frames import EXTENDED, FIRST_PART, PARTS
 from kontronik_can_gw.native.binding import load
 from kontronik_can_gw.native.core import NativeCore
@@ -369,7 +369,9 @@ class RunInBoth:
                 for place in objects:
                     length = TYPE_BITS[ENTRIES[place].data_type]
                     high = (1 << length) - 1
-                    value = BINDINGS[place].read(core.escs[0], core.status, now, high)
+                    bound = BINDINGS[place]
+                    esc = core.escs[0]
+                    value = bound.shown(esc, steps(bound.source, esc, core.status, now), high)
                     bits |= (high if value is None else value) << at
                     at += length
                 assert bits == right, f"SDO of {cob_id:X}h: {bits:016x} instead of {right:016x}"

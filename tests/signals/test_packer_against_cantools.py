@@ -105,7 +105,7 @@ def test_random_layout_is_packed_as_oracle_and_cantools_expect(seed: int) -> Non
     messages = [maker.message() for _ in range(MESSAGES)]
     text = dbc_text(messages)
     database = read(text)
-    layout = prepare(database, "x", ESCS, DbcConfig(bind=bindings(messages)), fd_allowed=True)
+    layout = prepare(database, "x", ESCS, DbcConfig(bind=bindings(messages)), is_fd_allowed=True)
     plans = {plan.name: plan for plan in layout.messages}
     assert len(plans) == MESSAGES
     makers = {name: compile_frame(plan) for name, plan in plans.items()}

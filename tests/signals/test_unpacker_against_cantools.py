@@ -47,7 +47,7 @@ def test_random_frames_are_decoded_as_cantools_does(seed: int) -> None:
     messages = [maker.message() for _ in range(MESSAGES)]
     database = read(dbc_text(messages))
     settings = DbcConfig(bind=bindings(messages))
-    layout = prepare(database, "random.dbc", ESCS, settings, fd_allowed=True)
+    layout = prepare(database, "random.dbc", ESCS, settings, is_fd_allowed=True)
     reader = SignalReader(layout)
     compared = 0
     for message, plan in zip(messages, layout.messages, strict=True):
@@ -196,7 +196,9 @@ def test_columns_of_many_frames_have_the_values_of_each_frame(seed: int) -> None
     maker = LayoutMaker(rng, ESCS)
     messages = [maker.message() for _ in range(MESSAGES)]
     settings = DbcConfig(bind=bindings(messages))
-    random_layout = prepare(read(dbc_text(messages)), "random.dbc", ESCS, settings, fd_allowed=True)
+    random_layout = prepare(
+        read(dbc_text(messages)), "random.dbc", ESCS, settings, is_fd_allowed=True
+    )
     shipped_layout = layout_of_dbc(shipped("dbc/kontronik_esc.dbc")).layout
     lost = 0
     for layout in (random_layout, shipped_layout):

@@ -148,7 +148,7 @@ def _message(
 def _messages(node: Node) -> Iterator[MessageRow]:
     """Yield the PDOs in the order of their numbers, the heartbeat and the emergency."""
     for tpdo in node.tpdos:
-        if tpdo.valid and tpdo.mapped:
+        if tpdo.is_valid and tpdo.mapped:
             yield _tpdo(tpdo, node)
     yield _heartbeat(node)
     if not node.emergencies.cob_id >> 31:
@@ -257,7 +257,7 @@ def _tpdo(tpdo: Tpdo, node: Node) -> MessageRow:
     if tpdo.type in EVENT_TYPES:
         cycle_ms = tpdo.event_ns // MS
         delay_ms = tpdo.inhibit_ns // MS
-        send_type = "OnChange" if tpdo.on_change else "Event"
+        send_type = "OnChange" if tpdo.is_sent_on_change else "Event"
         if cycle_ms:
             send_type = f"CyclicAnd{send_type}"
     else:

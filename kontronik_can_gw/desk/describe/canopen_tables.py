@@ -72,7 +72,7 @@ def _pdos(nodes: Sequence[tuple[str, Node]]) -> Iterator[Row]:
         if node.node_id == UNCONFIGURED:
             continue
         for tpdo in node.tpdos:
-            if not tpdo.valid:
+            if not tpdo.is_valid:
                 continue
             entries = [variable.entry for variable in tpdo.mapped]
             yield {
@@ -120,9 +120,9 @@ def _object(eds: Eds, entry: EdsEntry, meanings: Mapping[str, str]) -> Row:
         "name": name,
         "type": TYPE_NAMES[entry.data_type],
         "access": entry.access,
-        "pdo": entry.mappable,
+        "pdo": entry.is_mappable,
         "default": default,
-        "node_id": entry.relative,
+        "node_id": entry.is_relative,
         "min": entry.low,
         "max": entry.high,
         "step": step,

@@ -191,7 +191,7 @@ def _notes(message: MessagePlan, plan: SignalPlan) -> list[str]:
             notes.append(f"{found.name} reports the loss")
     if plan.role is Role.CRC:
         notes.append(str(message.e2e))
-    if plan.unbound:
+    if plan.is_unbound:
         notes.append(f"not bound to a value: always {held(plan)}")
     elif plan.role in (Role.CONSTANT, Role.DATA_ID):
         notes.append(f"always raw {plan.constant}")

@@ -90,7 +90,7 @@ def _compile_layout(
         file,
         escs,
         DbcConfig(node=node),
-        fd_allowed=True,
+        is_fd_allowed=True,
     )
     return BusLayout(database, layout, escs)
 
