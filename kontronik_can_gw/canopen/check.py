@@ -143,7 +143,7 @@ def _unlike(entry: EdsEntry, shipped: EdsEntry) -> Iterator[str]:
     elif (index, entry.sub) not in BINDINGS:  # the object stores its value
         bits = _BITS.get(index, TYPE_BITS[wanted])
         fitting = {kind for kind in WHOLE - SIGNED if TYPE_BITS[kind] >= bits}
-        problem = f"must be of an unsigned type of {bits} bits or more."
+        problem = f"must be of an unsigned whole-number type of {bits} bits or more."
     if entry.data_type not in fitting and index not in _FREE:
         yield problem
     if "w" not in shipped.access and "w" in entry.access and index not in _PLAIN:

@@ -4,7 +4,7 @@ It is built from an EDS. A variable either stores its value or is bound to a ser
 ``read`` returns its value at each access.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from enum import IntEnum
 
 from kontronik_can_gw.canopen.eds import CODECS, DOMAIN_TYPE, Eds, EdsEntry
@@ -286,7 +286,7 @@ class Dictionary:
 
     def reset(
         self,
-        profile: range,
+        indices: Container[int],
         node_id: int,
         stored: Mapping[int, bytes],
     ) -> list[int]:
@@ -295,9 +295,9 @@ class Dictionary:
         Returns the keys of stored values that were rejected because they do not fit this EDS.
         """
         held = self.variables
-        rejected = [key for key in stored if key >> 8 in profile and key not in held]
+        rejected = [key for key in stored if key >> 8 in indices and key not in held]
         for number, variable in held.items():
-            if number >> 8 not in profile:
+            if number >> 8 not in indices:
                 continue
             variable.value = variable.default(node_id)
             data = stored.get(number)
@@ -316,14 +316,14 @@ class Dictionary:
                 variable.value = value
         return rejected
 
-    def to_store(self, profile: range, node_id: int) -> dict[int, bytes]:
+    def to_store(self, indices: Container[int], node_id: int) -> dict[int, bytes]:
         """Return the raw bytes of the variables that differ from their defaults.
 
         The others need not be stored, and so continue to follow ``$NODEID``.
         """
         changed = {}
         for number, variable in self.variables.items():
-            if number >> 8 not in profile or variable.read is not None:
+            if number >> 8 not in indices or variable.read is not None:
                 continue
             if "rw" in variable.entry.access and variable.value != variable.default(node_id):
                 changed[number] = variable.encode(variable.value)

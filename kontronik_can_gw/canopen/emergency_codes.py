@@ -143,11 +143,8 @@ class BitCodes:
         register = 0
         for bit in _bits_of(summary_free & self._error_bits | bits):
             register |= register_of(self.code(bit))
-        conditions = []
-        for bit in _bits_of(bits):
-            condition = PresentError(self.code(bit), bit, 0)
-            conditions.append(condition)
-        return tuple(conditions), register
+        conditions = tuple(PresentError(self.code(bit), bit, 0) for bit in _bits_of(bits))
+        return conditions, register
 
 
 def _mask_of(bits: Sequence[ErrorBit], severity: Severity) -> int:

@@ -53,6 +53,8 @@ _INQUIRE = range(0x5A, 0x5E)
 """Inquiry of the same four parts."""
 _IDENTIFY = range(0x46, 0x4C)
 """Identification: vendor, product, lowest and highest revision, lowest and highest serial."""
+_IDENTIFIED_PARTS = (0, 1, 2, 2, 3, 3)
+"""The part of the identity for each of them."""
 
 OK = 0
 NODE_ID_OUT_OF_RANGE = 1
@@ -270,12 +272,10 @@ class LssSlave:
 
     def _is_in_range(self, service: int, number: int) -> bool:
         """Return True if this part of an identification matches the node."""
-        vendor, product, revision, serial = self._host.identity
-        if service == _IDENTIFY[0]:
-            return number == vendor
-        if service == _IDENTIFY[1]:
-            return number == product
-        own = revision if service < _IDENTIFY[4] else serial
+        part = _IDENTIFIED_PARTS[service - _IDENTIFY[0]]
+        own = self._host.identity[part]
+        if part < 2:
+            return own == number
         is_lowest = service in (_IDENTIFY[2], _IDENTIFY[4])
         return own >= number if is_lowest else own <= number
 

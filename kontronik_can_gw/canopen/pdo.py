@@ -288,7 +288,8 @@ class Tpdo:
             self.check()
         except SdoAbort:
             indices = (self.communication_index, self.mapping_index)
-            rejected = _restore_defaults(self._dictionary, indices, node_id)
+            rejected = list(self._dictionary.to_store(indices, node_id))
+            self._dictionary.reset(indices, node_id, {})
             self.read()
             cob_id = self._dictionary.get(self.communication_index, COB_ID)
             try:
@@ -416,23 +417,6 @@ def _check_type(value: int) -> None:
     """SdoAbort 06090030h for a new 180xh:2 that is reserved, 252 or 253 (on request by RTR)."""
     if LAST_SYNC_TYPE < value < EVENT_TYPES[0]:
         raise SdoAbort(Abort.VALUE)
-
-
-def _restore_defaults(
-    dictionary: Dictionary,
-    indices: Sequence[int],
-    node_id: int,
-) -> list[int]:
-    """Set the variables of these indices to their defaults. Returns the keys of changed ones."""
-    changed = []
-    for number, variable in dictionary.variables.items():
-        if number >> 8 not in indices:
-            continue
-        default = variable.default(node_id)
-        if variable.value != default:
-            changed.append(number)
-        variable.value = default
-    return changed
 
 
 class Tpdos(list[Tpdo]):

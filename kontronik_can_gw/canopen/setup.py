@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds
 from kontronik_can_gw.canopen.cob_ids import Use
-from kontronik_can_gw.canopen.dictionary import Dictionary
 from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds, with_vendor_id, without
 from kontronik_can_gw.canopen.eds import load as eds_of
 from kontronik_can_gw.canopen.node_settings import NodeSettings, NodeSetup, esc_settings
@@ -110,10 +109,6 @@ class CanopenSetup(OutputSetup):
             setups.append(NodeSetup(self.eds, settings, stored, base))
         return setups
 
-    def dictionary(self, number: int, esc: EscSettings) -> Dictionary:
-        """Return the dictionary of a node before its first reset."""
-        return self.node_setups[number].dictionary(esc)
-
     def nodes(
         self, escs: Sequence[EscSettings], message_ids: Mapping[int, str] | None = None
     ) -> Nodes:
@@ -185,20 +180,14 @@ class CanopenSetup(OutputSetup):
         setup = self
         warnings: list[str] = []
         while True:
-            clashing = setup._clashing(escs, message_ids)
-            with_ids: list[int] = []
-            with_node_id: list[int] = []
-            for number in sorted(clashing):
-                stored = setup.stored[number]
-                if stored.has_ids:
-                    with_ids.append(number)
-                if stored.node_id is not None:
-                    with_node_id.append(number)
+            clashing = sorted(setup._clashing(escs, message_ids))
+            held = setup.stored
+            with_node_id = [number for number in clashing if held[number].node_id is not None]
             # Nodes with a stored node-ID first: the other node of the clash may be right.
-            to_ignore = with_node_id or with_ids
+            to_ignore = with_node_id or [number for number in clashing if held[number].has_ids]
             if not to_ignore:
                 return replace(setup, notes=(*warnings, *self.notes))
-            kept = list(setup.stored)
+            kept = list(held)
             for number in to_ignore:
                 name = self.escs[number].name
                 warnings.append(
