@@ -234,6 +234,7 @@ OUTPUT_TOOLS = (
     "cli/eds.py",
     "desk/conformance/eds_",
     "desk/dbc/",
+    "desk/dcf.py",
     "desk/describe/",
 )
 """Modules that describe CANopen nodes: commands for EDS and DBC files, tables, a slave's EDS."""

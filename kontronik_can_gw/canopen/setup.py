@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 from kontronik_can_gw import __version__
 from kontronik_can_gw.canopen.check import check_eds
 from kontronik_can_gw.canopen.cob_ids import Use
-from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds, with_vendor_id, without
+from kontronik_can_gw.canopen.eds import MAX_BYTES, Eds
 from kontronik_can_gw.canopen.eds import load as eds_of
+from kontronik_can_gw.canopen.eds_changes import with_vendor_id, without
 from kontronik_can_gw.canopen.node_settings import NodeSettings, NodeSetup, esc_settings
 from kontronik_can_gw.canopen.nodes import Nodes, nodes_alone, traffic
 from kontronik_can_gw.canopen.pdo import COMMUNICATION, MAX_TPDOS

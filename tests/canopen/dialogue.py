@@ -16,7 +16,8 @@ from typing import Any
 from script import MS, Talker, bytes_of, hexadecimal, ms
 from sdo_client import Refused, download, upload
 
-from kontronik_can_gw.canopen.eds import Eds, load, without
+from kontronik_can_gw.canopen.eds import Eds, load
+from kontronik_can_gw.canopen.eds_changes import without
 from kontronik_can_gw.canopen.node import Node
 from kontronik_can_gw.canopen.node_settings import NodeSettings
 from kontronik_can_gw.canopen.nodes import Nodes

@@ -14,7 +14,8 @@ from eds_text import SHIPPED as SHIPPED_TEXT
 from eds_text import dcfchk, with_key
 
 from kontronik_can_gw.canopen import eds as reader
-from kontronik_can_gw.canopen.eds import Eds, EdsEntry, without
+from kontronik_can_gw.canopen.eds import Eds, EdsEntry
+from kontronik_can_gw.canopen.eds_changes import without
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.config.keys import EscConfig
 from kontronik_can_gw.desk import dcf

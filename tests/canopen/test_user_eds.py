@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 
 from kontronik_can_gw.canopen import eds as reader
 from kontronik_can_gw.canopen.check import check_eds
-from kontronik_can_gw.canopen.eds import EdsEntry, without
+from kontronik_can_gw.canopen.eds import EdsEntry
+from kontronik_can_gw.canopen.eds_changes import without
 from kontronik_can_gw.desk import dcf
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import EscSettings

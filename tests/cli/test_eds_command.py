@@ -10,7 +10,7 @@ import pytest
 from command_line import run, written
 
 from kontronik_can_gw.assembly.assemble import load_configuration
-from kontronik_can_gw.canopen.eds import without
+from kontronik_can_gw.canopen.eds_changes import without
 from kontronik_can_gw.canopen.objects import BINDINGS
 from kontronik_can_gw.canopen.setup import shipped_canopen
 from kontronik_can_gw.cli.common import canopen_of

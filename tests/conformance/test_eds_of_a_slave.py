@@ -8,7 +8,8 @@ from dialogue import Bench
 from script import MS
 from simulated_slave import EDS, simulated_slave
 
-from kontronik_can_gw.canopen.eds import load, with_vendor_id
+from kontronik_can_gw.canopen.eds import load
+from kontronik_can_gw.canopen.eds_changes import with_vendor_id
 from kontronik_can_gw.desk.conformance.eds_file import EdsFile, read_eds
 from kontronik_can_gw.desk.conformance.run import chosen_items, run
 

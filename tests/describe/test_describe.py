@@ -173,7 +173,7 @@ def test_objects_agree_with_canopen(facts: Facts) -> None:
             pdo=variable.pdo_mappable,
             min=variable.min,
             max=variable.max,
-            node_id=variable.is_relative,
+            node_id=variable.relative,
             default=None if found["shows"] else variable.default,
         )
         assert found["name"].startswith(item.name)
