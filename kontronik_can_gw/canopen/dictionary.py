@@ -156,6 +156,16 @@ def signature(word: bytes) -> Check:
     return check
 
 
+def only(allowed: Container[int]) -> Check:
+    """Return a check that refuses any other number with 06090030h."""
+
+    def check(value: int) -> None:
+        if value not in allowed:
+            raise SdoAbort(Abort.VALUE)
+
+    return check
+
+
 def _ignore(_variable: Variable, _has_changed: bool, _now: int) -> None:
     """Do nothing after a download."""
 

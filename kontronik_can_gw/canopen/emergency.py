@@ -11,7 +11,7 @@ from struct import Struct
 
 from kontronik_can_gw.canopen import objects as at
 from kontronik_can_gw.canopen.cob_ids import EMERGENCY, INVALID_BIT, Taken, check_free
-from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, only
 from kontronik_can_gw.canopen.emergency_codes import (
     FROM_GATEWAY,
     OF_COMMUNICATION,
@@ -91,7 +91,7 @@ class Emergencies:
         bind(
             0x1003,
             read=lambda _now: len(self.history),
-            check=_only_zero,
+            check=only((0,)),
             written=clear,
         )
         for variable in self._dictionary.subs(0x1003):
@@ -334,9 +334,3 @@ class Emergencies:
             raise SdoAbort(Abort.VALUE)
         if is_valid:
             check_free(value & 0x7FF, self, self._taken)
-
-
-def _only_zero(value: int) -> None:
-    """SdoAbort 06090030h for a new 1003h:0 other than 0, which clears the history."""
-    if value:
-        raise SdoAbort(Abort.VALUE)

@@ -9,7 +9,14 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
 
-from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Value, Variable
+from kontronik_can_gw.canopen.dictionary import (
+    Abort,
+    Dictionary,
+    SdoAbort,
+    Value,
+    Variable,
+    only,
+)
 from kontronik_can_gw.status import NmtState
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
@@ -69,7 +76,8 @@ class Nmt:
         self._dictionary = dictionary
         self._self_start = self_start
         self._entered = entered
-        dictionary.bind(0x1F80, check=_check_startup)
+        # Bit 2 is about starting by itself, bit 3 about starting others, which a slave ignores.
+        dictionary.bind(0x1F80, check=only((0, 4, 8, 12)))
 
     @property
     def starts_itself(self) -> bool:
@@ -103,15 +111,6 @@ class Nmt:
             self.enter(NmtState.PRE_OPERATIONAL, now)
         elif behaviour == 2 and self.communicates:
             self.enter(NmtState.STOPPED, now)
-
-
-def _check_startup(value: int) -> None:
-    """Check a new 1F80h. SdoAbort 06090030h for other bits than 2 and 3.
-
-    Bit 2 is about starting by itself, and bit 3 about starting others, which a slave ignores.
-    """
-    if value & ~0x0C:
-        raise SdoAbort(Abort.VALUE)
 
 
 class Producer:

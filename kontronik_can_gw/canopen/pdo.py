@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 
 from kontronik_can_gw.canopen.bound_values import bits_of, compile_pdo
 from kontronik_can_gw.canopen.cob_ids import INVALID_BIT, SYNC, Taken, check_free
-from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Variable, key
+from kontronik_can_gw.canopen.dictionary import Abort, Dictionary, SdoAbort, Variable, key, only
 from kontronik_can_gw.core.slots import Slot, SlotPlan, SlotSettings
 from kontronik_can_gw.esc.telemetry import Event
 from kontronik_can_gw.signals.plan import EXPECTED_LIVE_HZ
@@ -40,6 +40,8 @@ MAX_WAITING = 32
 """Maximum number of frames of one TPDO that wait after several SYNCs were read at once."""
 LAST_SYNC_TYPE = 240
 _MAX_BITS = 64
+_check_type = only((*range(LAST_SYNC_TYPE + 1), *EVENT_TYPES))
+"""Refuses a 180xh:2 that is reserved, 252 or 253 (on request by RTR)."""
 
 
 class SyncTransmission:
@@ -127,7 +129,7 @@ class SyncConsumer:
         self._dictionary = dictionary
         self._taken = taken
         dictionary.bind(0x1005, check=self._check_cob_id)
-        dictionary.bind(0x1019, check=_check_overflow)
+        dictionary.bind(0x1019, check=only((0, *range(2, LAST_SYNC_TYPE + 1))))
 
     @property
     def cob_id(self) -> int:
@@ -152,12 +154,6 @@ class SyncConsumer:
         if value & (_PRODUCER_BIT | _FRAME_BIT | 0x1FFFF800):
             raise SdoAbort(Abort.VALUE)
         check_free(value & 0x7FF, SYNC, self._taken)
-
-
-def _check_overflow(value: int) -> None:
-    """SdoAbort 06090030h unless a new 1019h is 0 (no counter) or 2 to 240."""
-    if value == 1 or value > 240:
-        raise SdoAbort(Abort.VALUE)
 
 
 class Tpdo:
@@ -411,12 +407,6 @@ def _check_length(mapped: Sequence[Variable]) -> None:
     """SdoAbort 06040042h for more than 64 bits."""
     if sum(map(bits_of, mapped)) > _MAX_BITS:
         raise SdoAbort(Abort.PDO_LENGTH)
-
-
-def _check_type(value: int) -> None:
-    """SdoAbort 06090030h for a new 180xh:2 that is reserved, 252 or 253 (on request by RTR)."""
-    if LAST_SYNC_TYPE < value < EVENT_TYPES[0]:
-        raise SdoAbort(Abort.VALUE)
 
 
 class Tpdos(list[Tpdo]):

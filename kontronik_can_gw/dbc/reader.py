@@ -148,11 +148,8 @@ def parse_database(
         raise UserError(f"{path}: has no messages. Is it a DBC?")
     _LEFT_OUT[database] = rewriting.left_out
     if warnings is not None:
-        for reason, entries in rewriting.ignored.items():
-            warnings.append(f"{path}: ignored entries {reason}: {listed(entries)}")
-        if rewriting.left_out:
-            texts = map("{0.name} ({0.sender}) {0.reason}".format, rewriting.left_out)
-            warnings.append(f"{path}: left out messages that cannot be sent: {listed(texts)}")
+        for reason, entries in rewriting.removed.items():
+            warnings.append(f"{path}: {reason}: {listed(entries)}")
         warnings += (f"{path}: {text}" for text in _equal_messages(database))
     return database
 
@@ -229,7 +226,7 @@ class _Rewriting:
     def __init__(self, text: str, path: str) -> None:
         self._path = path
         self._strings: list[str] = []
-        self.ignored: dict[str, list[str]] = {}
+        self.removed: dict[str, list[str]] = {}
         """The removed entries by reason."""
         self.left_out: list[LeftOut] = []
         self._left_out_numbers: set[str] = set()
@@ -273,7 +270,8 @@ class _Rewriting:
             return found[0]
         self.left_out.append(LeftOut(name, sender, reason))
         self._left_out_numbers.add(number.lstrip("0") or "0")
-        return "\n" * found[0].count("\n")
+        entry = f"{name} ({sender}) {reason}"
+        return self._remove(found, "left out messages that cannot be sent", entry)
 
     def _mask(self, found: re.Match[str]) -> str:
         self._strings.append(found[0])
@@ -285,7 +283,7 @@ class _Rewriting:
 
     def _remove(self, entry: re.Match[str], reason: str, name: str) -> str:
         """Record a removed entry. Return its line ends, which replace it."""
-        self.ignored.setdefault(reason, []).append(self._unmask(name))
+        self.removed.setdefault(reason, []).append(self._unmask(name))
         return "\n" * entry[0].count("\n")
 
     def _with_tables(self, text: str) -> str:
@@ -309,12 +307,13 @@ class _Rewriting:
                 if key not in signals and key[0] in self._left_out_numbers:
                     return "\n" * found[0].count("\n")
                 if key not in signals:
-                    return self._remove(found, "for signals that are not in the file", entry)
+                    reason = "ignored entries for signals that are not in the file"
+                    return self._remove(found, reason, entry)
             table = body.strip()
             if keyword != "VAL_" or not re.fullmatch(r"[A-Za-z_]\w*", table):
                 return found[0]
             if table not in tables:
-                reason = "that name a VAL_TABLE_ that is not in the file"
+                reason = "ignored entries that name a VAL_TABLE_ that is not in the file"
                 return self._remove(found, reason, f"{entry} {table}")
             return f"{found['head']}{tables[table]};"
 
@@ -327,7 +326,7 @@ class _Rewriting:
         def rewritten(found: re.Match[str]) -> str:
             if self._unmask(found[2]) in defined:
                 return found[0]
-            reason = "of attributes without a BA_DEF_"
+            reason = "ignored entries of attributes without a BA_DEF_"
             return self._remove(found, reason, f"{found[1]} {found[2]}")
 
         return _ATTRIBUTE.sub(rewritten, text)

@@ -299,7 +299,7 @@ class Dronecan(Output):
             self._send_second(now)
 
     def receive(self, frame: CanFrame, now: int, at: int) -> None:
-        if not frame.extended or frame.remote or frame.fd:
+        if (frame.extended, frame.remote, frame.fd) != (True, False, False):
             return
         can_id = frame.can_id
         source = can_id & NODE
