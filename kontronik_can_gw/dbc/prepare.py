@@ -56,10 +56,11 @@ def prepare(
     example the CANopen nodes with their COB-IDs. Raises UserError with all mistakes together.
     """
     node = choose_node(database, settings.node, file, settings.messages)
+    left_out = own_left_out(database, node, file, settings.messages)
     copies = copies_of(database, file, escs, settings)
     ours = [copy for copy in copies if node in copy.message.senders]
     job = Compilation(database, settings, Binder(escs, settings.bind), is_fd_allowed)
-    job.problems += own_left_out(database, node, file, settings.messages)
+    job.problems += left_out
     plans = [*_compiled(job, ours)]
     job.problems += _clashes(copies, node, taken_ids or {})
     if len(job.unbound) > _MANY:

@@ -643,6 +643,14 @@ def test_impossible_message_is_left_out_unless_the_gateway_sends_it(
     assert [plan.name for plan in layout.messages] == ["Power"]
 
 
+def test_file_whose_only_message_of_the_gateway_is_impossible_is_refused() -> None:
+    text = STATE.replace("BO_ 256 ", "BO_ 4000 ")
+    assert text != STATE
+    for base_id in (None, 0x300):
+        (line,) = refused(text, base_id=base_id)
+        assert line.startswith(f"{FILE}: Power: has the id FA0h")
+
+
 def test_equal_names_and_ids_are_warnings_with_the_file_and_not_of_the_library(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
