@@ -53,16 +53,11 @@ def clean_header(
             made[name] = _clean_file(value, part, cleaner, clean_dbc) if with_dbc else None
             cleaner.count(part, "DBC", not with_dbc)
         elif name == "canopen" and isinstance(value, dict):
-            made[name] = _clean_canopen(value, part, cleaner)
+            made[name] = _clean_value(value, part, cleaner)
+            if isinstance(value.get("eds"), dict):
+                made[name]["eds"] = _clean_file(value["eds"], part, cleaner, clean_eds)
         else:
             made[name] = _clean_value(value, part, cleaner)
-    return made
-
-
-def _clean_canopen(table: dict[str, Any], part: str, cleaner: Cleaner) -> dict[str, Any]:
-    made: dict[str, Any] = _clean_value(table, part, cleaner)
-    if isinstance(table.get("eds"), dict):
-        made["eds"] = _clean_file(table["eds"], part, cleaner, clean_eds)
     return made
 
 

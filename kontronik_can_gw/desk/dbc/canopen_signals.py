@@ -18,10 +18,11 @@ _MAX_START_VALUE_BITS = 32
 _ASCII_UNITS = {"°C": "degC", "µs": "us"}
 _LINK_BITS = 6
 """Number of bits of the link state in the link status 2020h:1."""
-_REPLAY_BIT = 6
-"""Bit of the link status."""
-_INFO_BIT = 7
-"""Bit of the link status."""
+_LINK_FLAGS = (
+    ("Replay", 6, "The values come from a recording, not from an ESC."),
+    ("InfoValid", 7, "The information of the ESC (its info frame) is fresh."),
+)
+"""The other bits of the link status."""
 _MIRRORS = 0x6000
 """From this index on, objects repeat values of others under names of CiA 402."""
 _NOTES = {
@@ -167,19 +168,11 @@ def _link(start: int, comment: str) -> list[SignalRow]:
         high=max(names),
         texts=names,
     )
-    replay = unsigned_signal(
-        "Replay",
-        start=start + _REPLAY_BIT,
-        length=1,
-        comment=f"{comment} The values come from a recording, not from an ESC.",
-    )
-    info = unsigned_signal(
-        "InfoValid",
-        start=start + _INFO_BIT,
-        length=1,
-        comment=f"{comment} The information of the ESC (its info frame) is fresh.",
-    )
-    return [state, replay, info]
+    flags = [
+        unsigned_signal(stem, start=start + bit, length=1, comment=f"{comment} {meaning}")
+        for stem, bit, meaning in _LINK_FLAGS
+    ]
+    return [state, *flags]
 
 
 def _named(

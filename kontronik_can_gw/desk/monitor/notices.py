@@ -37,18 +37,21 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, NoticeKind]
     if monitor.is_replay and not source.is_file:
         text = "REPLAY: the gateway plays a recording; these are not values of a live ESC."
         yield text, NoticeKind.REPLAY
+    has_none = not monitor.view.frames
     if source.problem:
         yield source.problem, NoticeKind.FAULT
-    elif source.has_ended and not monitor.view.frames:
+    elif source.has_ended and has_none:
         text = f"{source.name} contains no frame of {monitor.file}."
         yield f"{text} Give the DBC of its frames (-c, --dbc).", NoticeKind.FAULT
     elif monitor.is_quiet:
         yield "the gateway is quiet: it sends again when an ESC is heard.", NoticeKind.HINT
-    elif monitor.silent_ns >= SILENCE_NS and not source.is_file:
+    elif source.is_file:
+        pass  # a pause of a recording is no fault
+    elif monitor.silent_ns >= SILENCE_NS:
         yield f"no {frames}", NoticeKind.FAULT
         for hint in source.hints:
             yield hint, NoticeKind.HINT
-    elif not monitor.view.frames and not source.is_file:
+    elif has_none:
         yield f"waiting for {frames} ...", NoticeKind.WAITING
     count = monitor.gateway.number("esc_count")
     known = len(monitor.escs)

@@ -207,19 +207,16 @@ class MqttClient:
             self._faults.begin("broker", f"{self}: {self.problem}", now)
         elif self.problem == "":
             if self._reported_connections != self._connections:
-                self._report_connection(now)
+                if self._reported_connections == 0:
+                    self._faults.forget("broker")
+                    self._faults.log(logging.INFO, f"{self}: connected as {self._client_id}")
+                self._faults.end("broker", f"{self}: connected", now)
+                self._reported_connections = self._connections
                 self._waiting = self._lasting | self._waiting
             for topic in list(self._waiting):
                 if topic not in self._handed or _is_done(self._handed[topic]):
                     self._handed[topic] = self._send(self._waiting.pop(topic))
         self._faults.advance(now)
-
-    def _report_connection(self, now: int) -> None:
-        if self._reported_connections == 0:
-            self._faults.forget("broker")
-            self._faults.log(logging.INFO, f"{self}: connected as {self._client_id}")
-        self._faults.end("broker", f"{self}: connected", now)
-        self._reported_connections = self._connections
 
     def stop(self, seconds: float) -> None:
         """Publish "offline" and end the connection. Returns after ``seconds`` at the latest."""

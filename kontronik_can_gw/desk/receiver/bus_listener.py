@@ -39,8 +39,6 @@ class BusListener:
     def __init__(self, config: CanConfig, keys: frozenset[int], patient: bool = False) -> None:
         self.problem = ""
         """One line with the fault of the interface and its remedy. Empty while it works."""
-        self.lost_frames = 0
-        """Number of times that frames were lost because they were read too slowly."""
         self._config = config
         self._keys = keys
         self._port: CanPort | None = None
@@ -111,8 +109,6 @@ class BusListener:
         if self._port is None:
             return []
         frames = [frame for frame, _ in self._port.receive(_MAX_AT_ONCE)]
-        self.lost_frames += self._port.overruns
-        self._port.overruns = 0
         if self._port.gone:
             self.close()
             self.problem = f"CAN interface {self._config.channel}: was lost. Trying again."

@@ -3,7 +3,7 @@
 import fnmatch
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
@@ -28,7 +28,8 @@ time.
 """
 LEFT_OUT = frozenset({"sent_frames"})
 """Values that need the CAN frames, which are not made for a table."""
-_ORDER = (Group.LIVE, Group.LINK, Group.INFO, Group.GATEWAY)
+_ESC_GROUPS = (Group.LIVE, Group.LINK, Group.INFO)
+_GATEWAY_GROUPS = (Group.GATEWAY,)
 
 
 class ColumnType(Enum):
@@ -111,27 +112,18 @@ def fields_of_values(escs: Sequence[EscSettings]) -> list[TableColumn]:
     If there are several ESCs, their names precede the values' names: ``esc1.battery_voltage``.
     """
     found = []
-    for index, esc in enumerate(escs):
-        prefix = f"{esc.name}." if len(escs) > 1 else ""
-        values = values_of_esc(esc).values()
-        for group in _ORDER:
-            if group is not Group.GATEWAY:
-                found += _fields_of_group(values, group, prefix, index)
-    found += _fields_of_group(VALUES.values(), Group.GATEWAY, "", None)
-    return found
-
-
-def _fields_of_group(
-    values: Iterable[EscValue],
-    group: Group,
-    prefix: str,
-    esc: int | None,
-) -> list[TableColumn]:
-    return [
-        _field(value, prefix, esc)
-        for value in values
-        if value.group is group and value.supplied and value.name not in LEFT_OUT
+    owners: list[tuple[int | None, str]] = [
+        (index, f"{esc.name}." if len(escs) > 1 else "") for index, esc in enumerate(escs)
     ]
+    for esc, prefix in (*owners, (None, "")):
+        values = VALUES if esc is None else values_of_esc(escs[esc])
+        for group in _GATEWAY_GROUPS if esc is None else _ESC_GROUPS:
+            found += [
+                _field(value, prefix, esc)
+                for value in values.values()
+                if value.group is group and value.supplied and value.name not in LEFT_OUT
+            ]
+    return found
 
 
 def _field(value: EscValue, prefix: str, esc: int | None) -> TableColumn:

@@ -103,26 +103,19 @@ def _data(flight: Flight, wall_ns: int | None) -> dict[str, Any]:
             return None
         return round((time_ns - flight.origin_ns) / SECOND, 6)
 
-    events = []
-    for event in flight.events:
-        content = asdict(event)
-        content["from"] = seconds(event.begin_ns)
-        content["to"] = seconds(event.end_ns)
-        events.append(content)
-    cuts = []
-    for cut in flight.cuts:
-        length_s = cut.length_ns / SECOND
-        cuts.append([seconds(cut.begin_ns), length_s])
     return {
         "escs": [esc.name for esc in flight.escs],
         "from": seconds(flight.start_ns),
         "to": seconds(flight.end_ns),
         "wall": None if wall_ns is None else wall_ns // MS,
-        "cuts": cuts,
+        "cuts": [[seconds(cut.begin_ns), cut.length_ns / SECOND] for cut in flight.cuts],
         "times": [seconds(time_ns) for time_ns in flight.points.times],
         "phases": PHASES,
         "plots": list(_plots(flight)),
-        "events": events,
+        "events": [
+            asdict(event) | {"from": seconds(event.begin_ns), "to": seconds(event.end_ns)}
+            for event in flight.events
+        ],
     }
 
 
@@ -151,12 +144,16 @@ def _plots(flight: Flight) -> Iterator[dict[str, Any]]:
             title = plot.title
             if len(groups) > 1:
                 title = f"{', '.join(labels)} {plot.title[0].lower()}{plot.title[1:]}"
+            note = ""
+            if plot.has_one_shape and len(labels) > 1:
+                others = "the others differ only by pole pairs and gear"
+                note = f"{labels[0].lower()} drawn, {others}"
             series = [*_series(plot, lines, sources)]
             for drawn in _apart(series) if plot.is_noisy else [series]:
                 yield {
                     "key": f"{plot.key}-{number}" if number else plot.key,
                     "title": title,
-                    "note": _note_on_shape(labels) if plot.has_one_shape else "",
+                    "note": note,
                     "unit": VALUES[sources[0]].unit,
                     "digits": plot.digits,
                     "lines": labels,
@@ -173,10 +170,7 @@ def _apart(series: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
 
 def _top(line: Mapping[int, Sequence[Number]]) -> float:
     """Return the greatest magnitude in the lines of all ESCs."""
-    known: list[float] = []
-    for values in line.values():
-        known += [abs(value) for value in values if value is not None]
-    return max(known)
+    return max(abs(value) for values in line.values() for value in values if value is not None)
 
 
 def _series(plot: Plot, lines: Lines, sources: Sequence[str]) -> Iterator[dict[str, Any]]:
@@ -187,13 +181,6 @@ def _series(plot: Plot, lines: Lines, sources: Sequence[str]) -> Iterator[dict[s
             is_drawn = not plot.has_one_shape or esc not in escs_drawn
             escs_drawn.add(esc)
             yield {"esc": esc, "line": line, "values": values, "drawn": is_drawn}
-
-
-def _note_on_shape(labels: Sequence[str]) -> str:
-    """Return the note on the line that represents several lines of the same shape."""
-    if len(labels) < 2:
-        return ""
-    return f"{labels[0].lower()} drawn, the others differ only by pole pairs and gear"
 
 
 def of_like_size(tops: Mapping[str, float]) -> list[list[str]]:

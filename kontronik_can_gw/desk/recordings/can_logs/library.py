@@ -170,9 +170,7 @@ class Mf4Reader(LibraryReader):
         self._reader = reader
         start_s = reader._mdf.header.start_time.timestamp()
         groups = [group for group in reader._mdf.groups if group.channel_group.cycles_nr]
-        names: set[str] = set()
-        for group in groups:
-            names.update(channel.name for channel in group.channels)
+        names = {channel.name for group in groups for channel in group.channels}
         if groups and not any(name.startswith("CAN_") for name in names):
             self.close()
             raise UserError(
