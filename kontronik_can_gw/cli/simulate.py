@@ -147,12 +147,14 @@ def main(args: argparse.Namespace) -> int:
                 f"{name} {path}: needs {{n}} in the path, for the number of each of the "
                 f"{args.esc} ESCs."
             )
-    if args.output is not None and args.seconds is None:
-        raise UserError(f"-o {args.output}: would never end. Give --seconds.")
-    if args.output is not None and args.link is not None:
-        raise UserError(
-            "--link: cannot be combined with -o, which opens no pseudo terminal. Give one of them."
-        )
+    if args.output is not None:
+        if args.seconds is None:
+            raise UserError(f"-o {args.output}: would never end. Give --seconds.")
+        if args.link is not None:
+            raise UserError(
+                "--link: cannot be combined with -o, which opens no pseudo terminal. "
+                "Give one of them."
+            )
     device = args.device or ("jivepro" if args.layout == "legacy" else "kosmik")
     options = EscOptions(
         device=_DEVICES[device],
@@ -160,10 +162,10 @@ def main(args: argparse.Namespace) -> int:
         faults=Faults(flipped_bits=args.flip_bits, dropout=args.dropout, errors=tuple(args.error)),
     )
     # their starts are spread over the period, because real ESCs are not synchronized
-    escs = []
-    for index in range(args.esc):
-        start_ns = options.period_ns * index // args.esc
-        escs.append(SimulatedEsc(options, args.seed + index, start_ns))
+    escs = [
+        SimulatedEsc(options, args.seed + index, options.period_ns * index // args.esc)
+        for index in range(args.esc)
+    ]
     if args.output is not None:
         _to_files(
             escs,

@@ -23,7 +23,7 @@ _CONFIGURATION = 1
 _UNCONFIGURED = 0xFF
 
 
-def _begin(slave: Slave) -> None:
+def require_lss(slave: Slave) -> None:
     """Raise Skipped if the slave has no LSS, or if LSS would also reach other slaves."""
     if not section_of(slave.eds, "DeviceInfo").number("LSS_Supported"):
         raise Skipped("LSS_Supported=0 in the EDS")
@@ -62,7 +62,6 @@ def _bytes(value: int) -> bytes:
 
 
 def lss_switch_global(slave: Slave) -> str:
-    _begin(slave)
     _switch(slave, _CONFIGURATION)
     answers = _answers_until_sdo(slave)
     _switch(slave, _WAITING)
@@ -71,7 +70,6 @@ def lss_switch_global(slave: Slave) -> str:
 
 
 def lss_inquire_identity(slave: Slave) -> str:
-    _begin(slave)
     identity = _identity(slave)
     _switch(slave, _CONFIGURATION)
     for number, expected in enumerate(identity):
@@ -84,7 +82,6 @@ def lss_inquire_identity(slave: Slave) -> str:
 
 
 def lss_inquire_node_id(slave: Slave) -> str:
-    _begin(slave)
     _switch(slave, _CONFIGURATION)
     answer = _ask(slave, _INQUIRE_NODE_ID)
     _switch(slave, _WAITING)
@@ -93,7 +90,6 @@ def lss_inquire_node_id(slave: Slave) -> str:
 
 
 def lss_silent_while_waiting(slave: Slave) -> str:
-    _begin(slave)
     _send(slave, _INQUIRE_NODE_ID)
     require(not _answers_until_sdo(slave), "it was answered")
     return "no answer"
@@ -105,7 +101,6 @@ def _select(slave: Slave, identity: list[int]) -> None:
 
 
 def lss_switch_selective(slave: Slave) -> str:
-    _begin(slave)
     identity = _identity(slave)
     _select(slave, identity)
     answer = _answer(slave).data
@@ -115,7 +110,6 @@ def lss_switch_selective(slave: Slave) -> str:
 
 
 def lss_switch_selective_of_another_slave(slave: Slave) -> str:
-    _begin(slave)
     identity = _identity(slave)
     identity[3] ^= 1
     _select(slave, identity)
@@ -125,7 +119,6 @@ def lss_switch_selective_of_another_slave(slave: Slave) -> str:
 
 
 def lss_identify(slave: Slave) -> str:
-    _begin(slave)
     vendor, product, revision, serial = _identity(slave)
 
     def identify(low: int, high: int) -> None:
@@ -143,7 +136,6 @@ def lss_identify(slave: Slave) -> str:
 
 
 def lss_invalid_node_id(slave: Slave) -> str:
-    _begin(slave)
     _switch(slave, _CONFIGURATION)
     answers = [_ask(slave, _CONFIGURE_NODE_ID, bytes((number,))) for number in (0, 128)]
     _switch(slave, _WAITING)
@@ -152,7 +144,6 @@ def lss_invalid_node_id(slave: Slave) -> str:
 
 
 def lss_invalid_bit_timing(slave: Slave) -> str:
-    _begin(slave)
     _switch(slave, _CONFIGURATION)
     answer = _ask(slave, _CONFIGURE_BIT_TIMING, bytes((0, 200)))
     _switch(slave, _WAITING)
@@ -162,7 +153,6 @@ def lss_invalid_bit_timing(slave: Slave) -> str:
 
 
 def lss_configure_node_id(slave: Slave) -> str:
-    _begin(slave)
     old = slave.node_id
     new = old % 0x7F + 1
     for number in (new, old):
@@ -182,7 +172,6 @@ def lss_configure_node_id(slave: Slave) -> str:
 
 
 def lss_fastscan(slave: Slave) -> str:
-    _begin(slave)
     identity = _identity(slave)
     _switch(slave, _CONFIGURATION)
     answer = _ask(slave, _CONFIGURE_NODE_ID, bytes((_UNCONFIGURED,)))
@@ -255,7 +244,6 @@ def _give_back_node_id(slave: Slave) -> None:
 
 
 def lss_store(slave: Slave) -> str:
-    _begin(slave)
     _switch(slave, _CONFIGURATION)
     answer = _ask(slave, _STORE)
     _switch(slave, _WAITING)

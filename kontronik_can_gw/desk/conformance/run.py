@@ -166,6 +166,8 @@ def _run_item(slave: Slave, item: Item, reason: str) -> Result:
             index, _, sub = place.split()[-1].partition("h")
             if not slave.has(int(index, 16), int(sub[1:] or 0)):
                 raise Skipped(f"the EDS does not have {place}")
+        if item.group == "LSS":
+            lss_items.require_lss(slave)
         answer = item.run(slave)
     except Skipped as skipped:
         answer = str(skipped)
