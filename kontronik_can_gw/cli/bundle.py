@@ -74,7 +74,12 @@ def write_bundle(
         contents.missing.append("captures: left out by --without-captures")
     else:
         unit = unit_of(machine, str(config.absolute()))
-        folders = capture_folders(machine, config, unit, document)
+        folders = capture_folders(
+            machine,
+            config,
+            unit,
+            document,
+        )
         add_captures(
             contents,
             folders,

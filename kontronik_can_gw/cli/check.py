@@ -149,7 +149,12 @@ def details(loaded: Loaded) -> Iterator[str]:
         if lines := output.lines():
             yield from ("", *lines)
     if loaded.database is not None:
-        bus = BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
+        bus = BusLayout(
+            loaded.database,
+            loaded.layout,
+            loaded.escs,
+            loaded.config,
+        )
         text = markdown("Messages", [], dbc(bus, loaded.escs))
         yield from ("", *text.splitlines())
 

@@ -128,6 +128,16 @@ def _messages(config: Path | None, file: Path, escs: Sequence[EscSettings]) -> s
         for line in (*ignored, *layout.warnings):
             say(f"warning: {line}")
     version = re.sub(" ?layout [0-9A-F]{8}$", "", plain.version or "")
-    copies = copies_of(plain, layout.file, escs, settings)
+    copies = copies_of(
+        plain,
+        layout.file,
+        escs,
+        settings,
+    )
     version = f"{version} layout {layout.fingerprint}".strip()
-    return copies_text(plain, copies, version, layout.data_ids)
+    return copies_text(
+        plain,
+        copies,
+        version,
+        layout.data_ids,
+    )

@@ -65,7 +65,12 @@ def _page_of(bus: DemoBus) -> Iterator[None]:
     hub = server.Hub(Content(bus))
     bus.listeners.append(hub)
     bus.simulation += f", {address}"
-    page = server.LiveServer(hub, sock, None, Flights())
+    page = server.LiveServer(
+        hub,
+        sock,
+        None,
+        Flights(),
+    )
     thread = threading.Thread(target=page.serve, daemon=True)
     thread.start()
     yield

@@ -84,7 +84,12 @@ def _tables(args: argparse.Namespace) -> list[MarkdownTable]:
         escs = loaded.escs
         nodes = canopen_setup(loaded)
         if loaded.database:
-            bus = BusLayout(loaded.database, loaded.layout, escs, loaded.config)
+            bus = BusLayout(
+                loaded.database,
+                loaded.layout,
+                escs,
+                loaded.config,
+            )
     found: list[MarkdownTable] = []
     if bus is not None:
         found += dbc(bus, escs)

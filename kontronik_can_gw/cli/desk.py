@@ -45,7 +45,12 @@ def bus_layout(args: argparse.Namespace) -> BusLayout:
             f"{args.config}: dbc.enabled is false, so no messages of a DBC are sent. "
             "Give --dbc instead."
         )
-    return BusLayout(loaded.database, loaded.layout, loaded.escs, loaded.config)
+    return BusLayout(
+        loaded.database,
+        loaded.layout,
+        loaded.escs,
+        loaded.config,
+    )
 
 
 OpenInput = Callable[[Path, BusLayout | None], Input]

@@ -68,7 +68,12 @@ def main(args: argparse.Namespace) -> int:
         escs = loaded.escs
     text = setup.eds.data.decode("latin-1")  # keeps all bytes
     if args.node_id is not None:
-        text = _dcf(setup, escs, args.node_id, Path(args.output).name)
+        text = _dcf(
+            setup,
+            escs,
+            args.node_id,
+            Path(args.output).name,
+        )
     inputs = configuration_files(path)
     write_output(
         args.output,

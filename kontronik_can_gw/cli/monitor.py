@@ -70,7 +70,12 @@ def main(args: argparse.Namespace) -> int:
     with opened as source, stopping_on_signals(stop.set):
         monitor = Monitor(source.bus)
         if args.stream:
-            stream(source, monitor, _print_document, stop.is_set)
+            stream(
+                source,
+                monitor,
+                _print_document,
+                stop.is_set,
+            )
             return 0
         if not args.once:
             watch(source, monitor, stop.is_set)
@@ -81,7 +86,12 @@ def main(args: argparse.Namespace) -> int:
             else:
                 say(f"{seen} read from {source.name}")
             return 0
-        document = once(source, monitor, args.timeout or _ONCE_S, stop.is_set)
+        document = once(
+            source,
+            monitor,
+            args.timeout or _ONCE_S,
+            stop.is_set,
+        )
         if stop.is_set():
             return 130
     _print_document(document)

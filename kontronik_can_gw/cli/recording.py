@@ -68,7 +68,12 @@ def recorded(
         recorder = EventRecorder(folder, record, len(loaded.escs))
     parts = (in_words(loaded.config, folder), events_in_words(loaded.config))
     recorder.words = ", ".join(filter(None, parts))
-    gateway = RecordedGateway(recorder.put, loaded.core_settings, now, loaded.outputs)
+    gateway = RecordedGateway(
+        recorder.put,
+        loaded.core_settings,
+        now,
+        loaded.outputs,
+    )
     if isinstance(recorder, EventRecorder):
         EventWatch(gateway, record, recorder.trigger)
     known = {

@@ -181,7 +181,12 @@ def _on_can(args: argparse.Namespace, recording: PlayedInput, pace: Pace) -> str
                 continue
             if not pace.wait(time_ns):
                 break
-            _send(port, frame, can.channel, pace)
+            _send(
+                port,
+                frame,
+                can.channel,
+                pace,
+            )
             count += 1
     finally:
         port.close()

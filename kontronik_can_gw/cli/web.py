@@ -102,11 +102,21 @@ def main(args: argparse.Namespace) -> int:
     with source_of(args, recording, patient=True) as source:
         sock = server.listen(host, port)
         cache = access.cache_folder(args.cache)
-        address = access.Address.stored(cache, host, sock.getsockname()[1], is_open)
+        address = access.Address.stored(
+            cache,
+            host,
+            sock.getsockname()[1],
+            is_open,
+        )
         captures, min_free_mb = _captures_of(args, source)
         flights = Flights(captures, min_free_mb, cache)
         hub = server.Hub(Content(source, flights.disk))
-        page = server.LiveServer(hub, sock, None if is_open else address.token, flights)
+        page = server.LiveServer(
+            hub,
+            sock,
+            None if is_open else address.token,
+            flights,
+        )
 
         def feed() -> None:
             try:

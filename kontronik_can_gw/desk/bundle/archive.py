@@ -73,7 +73,12 @@ def write_archive(file: IO[bytes], contents: Contents, made_ns: int) -> None:
     parts = list(contents.parts)
     while True:
         try:
-            _write(raw, parts, contents, made_ns)
+            _write(
+                raw,
+                parts,
+                contents,
+                made_ns,
+            )
             return
         except OSError as error:
             if error.errno not in _FULL or not parts:

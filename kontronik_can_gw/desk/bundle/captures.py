@@ -55,7 +55,12 @@ def clean_header(
         elif name == "canopen" and isinstance(value, dict):
             made[name] = _clean_value(value, part, cleaner)
             if isinstance(value.get("eds"), dict):
-                made[name]["eds"] = _clean_file(value["eds"], part, cleaner, clean_eds)
+                made[name]["eds"] = _clean_file(
+                    value["eds"],
+                    part,
+                    cleaner,
+                    clean_eds,
+                )
         else:
             made[name] = _clean_value(value, part, cleaner)
     return made

@@ -293,7 +293,12 @@ def _refused_entry(slave: Slave, entry: int, *codes: int) -> str:
 
 def pdo_mapping_of_no_object(slave: Slave) -> str:
     index = next(index for index in range(0x5FFF, 0x2000, -1) if index not in slave.dictionary)
-    return _refused_entry(slave, index << 16 | 0x08, NO_OBJECT, _CANNOT_BE_MAPPED)
+    return _refused_entry(
+        slave,
+        index << 16 | 0x08,
+        NO_OBJECT,
+        _CANNOT_BE_MAPPED,
+    )
 
 
 def pdo_mapping_of_an_unmappable_object(slave: Slave) -> str:

@@ -204,7 +204,12 @@ def slave_on_bus(
     except Exception as error:  # the drivers raise exceptions of any kind
         raise RunError(f"CAN {channel}: cannot be opened: {error}.") from None
     with bus:
-        slave = Slave(bus, node_id, eds, limit_s)
+        slave = Slave(
+            bus,
+            node_id,
+            eds,
+            limit_s,
+        )
         try:
             slave.read(0x1000)
         except NoAnswer:

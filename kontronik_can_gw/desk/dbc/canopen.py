@@ -68,7 +68,12 @@ def pdo_text(nodes: Nodes, escs: Sequence[EscSettings]) -> str:
             continue
         prefix = esc_prefix(esc.name) if len(escs) > 1 else ""
         for message in _messages(node):
-            _make_names_unique(message, prefix, message_names, signal_names)
+            _make_names_unique(
+                message,
+                prefix,
+                message_names,
+                signal_names,
+            )
             messages.append(message)
     head_text = _HEAD % _about(nodes, escs)
     head = parse_database(head_text.encode(), "PDOs")

@@ -72,7 +72,12 @@ def signals_of(
     if bound is not None and not place.signed:
         bits = protocol.errors.get(bound.source.name)
         if bits:
-            return _error_word(bits, start, place.length, comment)
+            return _error_word(
+                bits,
+                start,
+                place.length,
+                comment,
+            )
         if bound.source.name == "link_status":
             return _link(start, comment)
     signal = SignalRow(

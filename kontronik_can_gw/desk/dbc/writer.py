@@ -89,7 +89,12 @@ def copies_text(
         copies = [Copy(message) for message in database.messages]
     relations = [*_relations(database, copies)]
     messages = [_message(copy, data_ids.get(copy.key)) for copy in copies]
-    return dbc_text(database, messages, version, relations)
+    return dbc_text(
+        database,
+        messages,
+        version,
+        relations,
+    )
 
 
 def dbc_text(

@@ -69,7 +69,12 @@ def check_can(machine: Machine, can: CanConfig) -> list[Finding]:
         has_restart = kind != "can" or machine.exists(f"{folder}/device")
         data = link.get("info_data", {})
         if is_up or _bitrate(data):  # otherwise the command that starts it sets all of it
-            _check_timing(findings, can, data, has_restart)
+            _check_timing(
+                findings,
+                can,
+                data,
+                has_restart,
+            )
         _check_state(findings, data, has_restart)
         driver = machine.target_of(f"{folder}/device/driver").rpartition("/")[2]
         if driver == _CRASHING_DRIVER and data.get("restart_ms"):

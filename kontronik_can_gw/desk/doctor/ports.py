@@ -62,7 +62,12 @@ def check_port(
         findings.add("port.telemetry", "none", diagnosis=diagnosis)
     group = machine.group_name(status.st_gid)
     findings.add("port.permission", _permission(machine, port, status), group=group)
-    _check_users(machine, findings, status, is_pty)
+    _check_users(
+        machine,
+        findings,
+        status,
+        is_pty,
+    )
     if is_pty:
         return findings.found
     if usb:

@@ -187,7 +187,12 @@ class Address(NamedTuple):
             content = json.loads((folder / _FILE).read_text(encoding="utf-8"))
             token = str(content["token"])
             ipaddress.ip_address(content["host"])
-            return cls(content["host"], int(content["port"]), token, bool(content["is_open"]))
+            return cls(
+                content["host"],
+                int(content["port"]),
+                token,
+                bool(content["is_open"]),
+            )
         except (FileNotFoundError, ValueError, LookupError, TypeError):
             return None
 
@@ -200,7 +205,12 @@ class Address(NamedTuple):
         try:
             before = cls.stored_in(folder)
             token = before.token if before else secrets.token_urlsafe(16)
-            address = cls(host, port, token, is_open)
+            address = cls(
+                host,
+                port,
+                token,
+                is_open,
+            )
             part = folder / f"{_FILE}.part"
             content = json.dumps(address._asdict())
             write_new(

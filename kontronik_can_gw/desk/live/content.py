@@ -170,7 +170,12 @@ class Content:
             trouble = trouble_of(esc)
             if trouble is not None:
                 flags.insert(0, trouble)
-            self._alarms.update(index, alarms_of(flags), _known_alarms(esc), now)
+            self._alarms.update(
+                index,
+                alarms_of(flags),
+                _known_alarms(esc),
+                now,
+            )
         self._end_steps(now)
         ended = list(self._ended)
         self._ended.clear()

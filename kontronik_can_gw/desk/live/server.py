@@ -280,7 +280,12 @@ class LiveServer:
         self._hub = hub
         self._sock = sock
         self._flights = flights
-        app = AccessGuard(application(hub, flights), token, sock.getsockname()[1], own_names())
+        app = AccessGuard(
+            application(hub, flights),
+            token,
+            sock.getsockname()[1],
+            own_names(),
+        )
         self._server = _Server(
             uvicorn.Config(
                 app,
