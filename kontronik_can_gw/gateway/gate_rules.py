@@ -16,6 +16,7 @@ from kontronik_can_gw.gateway.gate_table import (
     If,
     State,
 )
+from kontronik_can_gw.gateway.under_way import UNCOUNTED
 from kontronik_can_gw.times import NEVER
 
 # --- acts that change the gate
@@ -101,7 +102,7 @@ def _note_slow(gate: GateState, _now: int) -> None:
 
 
 def _is_blocked(gate: GateState, now: int) -> bool:
-    if not gate.under_way.count:
+    if gate.under_way.count == UNCOUNTED:
         return False
     limit = gate.timeout_ns * 7 // 8
     if gate.state is State.SLOW and gate.limit.takes_long:
@@ -172,7 +173,7 @@ def _has_worked(gate: GateState, now: int) -> bool:
     if gate.restart.asked == -NEVER or now - gate.restart.works_since < WORKED_NS:
         return False
     count = gate.under_way.count
-    return not count or count >= gate.restart.works_count
+    return count == UNCOUNTED or count >= gate.restart.works_count
 
 
 TESTS: Mapping[If, Callable[[GateState, int], bool]] = {
@@ -193,7 +194,7 @@ TESTS: Mapping[If, Callable[[GateState, int], bool]] = {
     If.LATE_LONG: lambda gate, _now: (
         not gate.is_slow and gate.limit.late - gate.limit.since >= LASTING_NS
     ),
-    If.UNCOUNTED: lambda gate, _now: not gate.under_way.count,
+    If.UNCOUNTED: lambda gate, _now: gate.under_way.count == UNCOUNTED,
     If.NO_FIRST_OPENS: _is_opened_without_first,
     If.NO_FIRST: lambda gate, _now: gate.first.is_missing,
     If.FIRST_LEFT: _has_first_left,

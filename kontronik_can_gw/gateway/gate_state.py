@@ -189,12 +189,12 @@ class GateState:
             return self.retry_due
         if state in NO_PORT and state is not State.BUS_OFF:
             return NEVER
+        if state is State.SLOW:
+            return min(self.look_due, self.limit.quarter_due)
         due = min(self.retry_due, self.look_due)
         if state in HELD and state not in NO_PORT and state is not State.QUIET_BLOCKED:
             due = min(due, self.discarded + LASTING_NS)
-        if state is State.SLOW:
-            due = min(due, self.limit.quarter_due)
-        elif state is State.RESTARTING:
+        if state is State.RESTARTING:
             due = min(due, self.restart.asked + ANSWER_NS)
         elif self.may_ask:
             due = min(due, self.restart_due)

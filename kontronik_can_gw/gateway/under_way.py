@@ -2,15 +2,19 @@
 
 from collections import deque
 
+from kontronik_can_gw.gateway.gate_table import UNLIMITED
 from kontronik_can_gw.times import NEVER
+
+UNCOUNTED = -1
+"""The count of an interface whose number of sent frames is not known."""
 
 
 class UnderWay:
     """The frames that the interface has accepted and that have not left it.
 
     The interface's count includes frames of other programs, which share its queue. So a frame has
-    left only if it has also left the kernel's queue. A count of 0 means that the driver does not
-    count.
+    left only if it has also left the kernel's queue. A count of 0 is usual before the first frame
+    has left. It is taken as ``UNCOUNTED`` after more frames than kernel and driver can hold.
     """
 
     def __init__(self) -> None:
@@ -45,9 +49,11 @@ class UnderWay:
         ``queued`` is the number of own frames in the kernel's queue. A count that is smaller than
         before was reset. Then the frames under way are forgotten.
         """
+        if not count and (self.count == UNCOUNTED or self.frames - queued > UNLIMITED):
+            count = UNCOUNTED
         moved = count - self.count
         self.count = count
-        if not count or moved < 0:
+        if count == UNCOUNTED or moved < 0:
             moved = self.frames
         self._remove(max(0, min(moved, self.frames - queued)))
         self.add(queued - self.frames if queued > self.frames else 0, self.looked)

@@ -30,7 +30,8 @@ enum {
     FD_SIZE = 72,       /* Size of struct canfd_frame. */
     MEMINFO_WORDS = 9,  /* Figures of SO_MEMINFO. */
     MEMINFO_QUEUED = 2, /* Place of the memory of frames in the kernel's queue. */
-    MAX_DIGITS = 32     /* Bytes that are read of a number in /sys. */
+    MAX_DIGITS = 32,    /* Bytes that are read of a number in /sys. */
+    UNCOUNTED = -1      /* The count of an interface that has none (gateway/under_way.py). */
 };
 
 static int64_t now_ns(void)
@@ -103,12 +104,12 @@ static int serve(kcg_turns *t)
     return 1;
 }
 
-/* Returns how many frames have left the interface, or 0 if that is not known. */
+/* Returns how many frames have left the interface, or UNCOUNTED if that is not known. */
 static int64_t frames_left(const kcg_turns *t)
 {
     char digits[MAX_DIGITS + 1] = "";
-    ssize_t size = t->request.count_fd < 0 ? -1 : pread(t->request.count_fd, digits, MAX_DIGITS, 0);
-    return size > 0 ? strtoll(digits, NULL, 10) : 0;
+    ssize_t size = pread(t->request.count_fd, digits, MAX_DIGITS, 0);
+    return size > 0 ? strtoll(digits, NULL, 10) : UNCOUNTED;
 }
 
 /* Returns how many own frames wait in the kernel's queue, or 0 if that is not known. */
@@ -131,9 +132,11 @@ static int is_late(kcg_turns *t)
     if (now < d->check_due)
         return 0;
     int64_t count = frames_left(t), queued = frames_queued(t);
+    if (!count && d->count == UNCOUNTED)
+        count = UNCOUNTED;
     int64_t frames = d->older + d->newer, left = count - d->count;
     int has_left = left != 0;
-    if (!count || left < 0)
+    if (count == UNCOUNTED || left < 0)
         left = frames;
     left = left < frames - queued ? left : frames - queued;
     left = left > 0 ? left : 0;

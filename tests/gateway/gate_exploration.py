@@ -33,6 +33,7 @@ from kontronik_can_gw.gateway.gate_table import (
     Row,
     State,
 )
+from kontronik_can_gw.gateway.under_way import UNCOUNTED
 from kontronik_can_gw.times import MS, NEVER, SECOND
 
 TIMEOUT = 200 * MS
@@ -89,7 +90,7 @@ def limits(gate: Gate) -> dict[str, int]:
             found["refused"] = gate.refused_since + LASTING_NS
         if state is not State.QUIET:
             found["late"] = gate.under_way.oldest + TIMEOUT // 4 + 1
-        if gate.under_way.count:
+        if gate.under_way.count != UNCOUNTED:
             found["blocked"] = gate.still_since + TIMEOUT * 7 // 8
         if restart.asked != -NEVER:
             found["worked"] = restart.works_since + WORKED_NS
@@ -135,7 +136,7 @@ def key_of(gate: Gate, now: int) -> Key:
     key += [passed, order]
     if state in _SHUT:
         return tuple(key)
-    has_count = gate.under_way.count > 0
+    has_count = gate.under_way.count != UNCOUNTED
     key += [gate.is_socket, gate.is_off, gate.is_off and gate.stays_off, has_count]
     key += [gate.is_slow, gate.limit.takes_long]
     if state not in (State.BUS_OFF, State.SETTLING):
@@ -178,8 +179,8 @@ def _leave_bus_off(is_running: bool, is_reported: bool) -> Step:
 _OPENINGS: dict[str, Step] = {
     "opening": lambda gate, now: gate.opening(now),
     "opened": lambda gate, now: gate.opened(7, now),
-    "opened, uncounted": lambda gate, now: gate.opened(0, now),
-    "opened, no socket": lambda gate, now: gate.opened(0, now, is_socket=False),
+    "opened, uncounted": lambda gate, now: gate.opened(UNCOUNTED, now),
+    "opened, no socket": lambda gate, now: gate.opened(UNCOUNTED, now, is_socket=False),
     "lost": lambda gate, now: gate.lost(False, now),
 }
 _OF_ALL: dict[str, Step] = {
@@ -213,7 +214,7 @@ _OF_COUNT: dict[str, Step] = {
     "stood still, one waits": _move(0, 1),
     "reset": lambda gate, now: gate.look(1, 0, now),
 }
-_UNCOUNTED: dict[str, Step] = {
+_OF_NO_COUNT: dict[str, Step] = {
     "looked": _move(0, 0),
     "looked, one waits": _move(0, 1),
 }
@@ -229,7 +230,7 @@ def events_of(gate: NotedGate, now: int) -> Iterator[tuple[str, Step]]:
     if gate.is_off:
         yield from _OF_OFF.items()
         return
-    yield from (_OF_COUNT if gate.under_way.count else _UNCOUNTED).items()
+    yield from (_OF_NO_COUNT if gate.under_way.count == UNCOUNTED else _OF_COUNT).items()
     if gate.state is State.SLOW:
         yield from _OF_SLOW.items()
     yield from _handed_over(gate, now)

@@ -14,6 +14,7 @@ from kontronik_can_gw.gateway.gate_table import (
     Act,
     State,
 )
+from kontronik_can_gw.gateway.under_way import UNCOUNTED
 from kontronik_can_gw.times import MS, SECOND
 
 pytestmark = pytest.mark.promise("gate")
@@ -92,13 +93,48 @@ def test_all_states_that_can_be_reached_keep_the_invariants() -> None:
     assert found.rows.keys() == set(TABLE), [row for row in TABLE if row not in found.rows]
 
 
-def test_count_of_0_blocks_nothing() -> None:
-    """There are drivers that do not count."""
+def test_interface_without_a_count_is_never_blocked() -> None:
+    gate = Gate(TIMEOUT)
+    gate.opened(UNCOUNTED, 0)
+    gate.accepted(1, 0)
+    gate.look(UNCOUNTED, 0, SECOND)
+    assert gate.state is State.OPEN
+
+
+def test_interface_that_has_sent_nothing_yet_is_blocked() -> None:
     gate = Gate(TIMEOUT)
     gate.opened(0, 0)
     gate.accepted(1, 0)
-    gate.look(0, 0, SECOND)
+    gate.look(0, 0, TIMEOUT)
+    assert gate.state is State.BLOCKED
+    gate.accepted_first(TIMEOUT)
+    gate.look(0, 0, TIMEOUT + SECOND)
+    assert gate.state is State.FIRST
+
+
+def test_driver_whose_count_stays_0_has_no_count_after_many_frames() -> None:
+    """It has taken more frames than it can hold."""
+    gate = Gate(TIMEOUT)
+    gate.opened(0, 0)
+    for now in (0, 100 * MS):
+        gate.accepted(UNLIMITED + 1, now)
+        gate.look(0, 0, now + 1)
+    gate.accepted(1, SECOND)
+    gate.look(0, 0, 2 * SECOND)
     assert gate.state is State.OPEN
+
+
+def test_wait_on_a_slow_bus_ends_in_the_future_although_a_refused_frame_may_be_tried() -> None:
+    """The loop would use all CPU time otherwise."""
+    gate = Gate(TIMEOUT)
+    gate.opened(7, 0)
+    gate.accepted(30, 0)
+    gate.refused(is_full=True, now=0)
+    for now in range(60 * MS, 2 * SECOND, 20 * MS):
+        gate.look(7 + now // (150 * MS), 6, now)
+        gate.advance(now)
+        assert gate.state is State.SLOW
+        assert gate.due > now
 
 
 def test_limit_of_a_slow_bus_halves_and_grows() -> None:

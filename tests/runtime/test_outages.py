@@ -26,6 +26,7 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native import load
+from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS, SECOND
@@ -64,6 +65,7 @@ class Recorded:
         patch: pytest.MonkeyPatch,
         layout: MessageLayout,
         outputs: Sequence[OutputMaker] = (),
+        is_unplugged: bool = False,
     ) -> None:
         self.entries: list[Entry] = []
         self.layout = layout
@@ -71,6 +73,9 @@ class Recorded:
         self.world = World()
         self.bus = self.world.bus
         self.bus.frame_ns = FRAME_NS
+        if is_unplugged:
+            self.bus.count = 0  # since the interface was made
+            self.bus.block()
         self.begun = self.world.now
         self._patch = patch
         patch.setattr(wire_world, "Gateway", self._gateway)
@@ -227,6 +232,31 @@ def test_blocked_interface_that_is_restarted_sends_no_old_value(
     assert max(ages) < TIMEOUT
     assert after[0][1].can_id == STATUS
     assert [frame.can_id for _, frame in after].count(0x701) >= 1
+
+
+@in_both_cores
+@pytest.mark.promise("restarts")
+def test_interface_that_has_sent_nothing_yet_is_restarted_and_sends_no_old_value(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The bus is unplugged from the start. The interface's count of sent frames is 0."""
+    it = Recorded(monkeypatch, with_status(), [nodes()], is_unplugged=True)
+    asked: list[int] = []
+    it.loop.can.gate.restart.after_ns = it.loop.can.gate.restart.pause_ns = SECOND // 2
+    it.loop.can.transmitter.ask_restart = lambda _channel: asked.append(it.world.now)
+    for number in range(1, 4):
+        it.run(number * SECOND)
+        assert len(asked) == number, "no frame leaves"
+        it.bus.discard_waiting()
+        it.loop.can._follow(LinkFacts(exists=True, up=False), it.world.now)
+    it.run(100 * MS)
+    it.bus.free()
+    it.run(SECOND)
+    it.bus.frames_left()
+    ages = [age for each in it.bus.arrived if (age := age_of(it.world, *each)) is not None]
+    assert ages
+    assert max(ages) < TIMEOUT
+    assert it.bus.arrived[0][1].can_id == STATUS
 
 
 def test_recording_that_begins_in_an_outage_holds_frames_in_its_replay() -> None:

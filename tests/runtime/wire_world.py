@@ -203,7 +203,7 @@ class Bus(CanPort):
         self._is_blocked = False
         self.passes = 0
         """Number of frames that a blocked interface still takes."""
-        self._count = 1
+        self.count = 1
         """Number of frames that have left the interface."""
         self.on_send: Callable[[CanFrame], None] = lambda _frame: None
         self._world = world
@@ -246,7 +246,7 @@ class Bus(CanPort):
 
     def frames_left(self) -> int:
         self._pass_time()
-        return self._count
+        return self.count
 
     def frames_queued(self) -> int:
         """Return how many frames wait behind the one in the controller."""
@@ -290,7 +290,7 @@ class Bus(CanPort):
             self._out[: len(passed)] = [(now, frame) for _, frame in passed]
         sent = [each for each in self._out if each[0] <= now]
         self.arrived += sent
-        self._count += len(sent)
+        self.count += len(sent)
         self._out = self._out[len(sent) :]
 
     def _send_each(
@@ -311,7 +311,7 @@ class Bus(CanPort):
                 self.refused.append(self._world.now)
                 self._world.now += MS // 10
                 return count, self.answer
-            self._count += not self.frame_ns
+            self.count += not self.frame_ns
             self.sent.append((self._world.now, frame))
             self.on_send(frame)
         return len(frames), Sent.OK
@@ -364,6 +364,7 @@ class World:
 
     def unregister(self, fd: int) -> None:
         del self.handlers[fd]
+        del self._events[fd]
 
     def wait(
         self,

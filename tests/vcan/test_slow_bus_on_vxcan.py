@@ -51,11 +51,36 @@ def slow_pair(rate: int) -> Iterator[tuple[str, str]]:
     try:
         ip("link", "set", near, "up")
         ip("link", "set", far, "up")
-        limit = f"dev {near} root tbf rate {128 * rate}bit burst 16 limit 16000"
-        subprocess.run(["tc", "qdisc", "add", *limit.split()], check=True)
+        let_leave("add", near, 128 * rate)
         yield near, far
     finally:
         subprocess.run(["ip", "link", "del", near], capture_output=True, check=False)
+
+
+def let_leave(command: str, near: str, bits: int) -> None:
+    """Add or change the limit of an interface, in bit/s. A frame has 128."""
+    limit = f"dev {near} root tbf rate {bits}bit burst 16 limit 16000"
+    subprocess.run(["tc", "qdisc", command, *limit.split()], check=True)
+
+
+def start_gateway(
+    near: str, escs: list[PtyPort], folder: Path, language: str, patch: pytest.MonkeyPatch
+) -> GatewayProcess:
+    """Start a gateway that sends three messages with values."""
+    if language == "Python":
+        patch.setenv(load.PURE, "1")
+    elif load.library()[0] is None:
+        pytest.skip("this machine has no core in C")
+    messages = [Msg(f"M{n}", 0x100 + n, 8, [Sig("Charge", 0, 16)]) for n in range(3)]
+    (folder / "own.dbc").write_text(dbc_text(messages, TIMES))
+    bind = "".join(f'"M{n}.Charge" = "consumed_charge"\n' for n in range(3))
+    toml = f'[dbc]\nfile = "{folder}/own.dbc"\n[dbc.bind]\n{bind}'
+    config = folder / "gateway.toml"
+    config.write_text(configuration(near, escs, toml, "telemetry_timeout_ms = 250"))
+    gateway = GatewayProcess(config)
+    gateway.wait_for_line("CAN socketcan")
+    escs[0].on = True
+    return gateway
 
 
 class Other:
@@ -110,22 +135,10 @@ def test_no_value_is_old_at_the_far_end_of_a_slow_bus(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    if language == "Python":
-        monkeypatch.setenv(load.PURE, "1")
-    elif load.library()[0] is None:
-        pytest.skip("this machine has no core in C")
-    messages = [Msg(f"M{n}", 0x100 + n, 8, [Sig("Charge", 0, 16)]) for n in range(3)]
-    (tmp_path / "own.dbc").write_text(dbc_text(messages, TIMES))
-    bind = "".join(f'"M{n}.Charge" = "consumed_charge"\n' for n in range(3))
-    toml = f'[dbc]\nfile = "{tmp_path}/own.dbc"\n[dbc.bind]\n{bind}'
     with slow_pair(rate) as (near, far):
-        config = tmp_path / "gateway.toml"
-        config.write_text(configuration(near, escs, toml, "telemetry_timeout_ms = 250"))
-        gateway = GatewayProcess(config)
+        gateway = start_gateway(near, escs, tmp_path, language, monkeypatch)
         other = Other(near) if has_other else None
         try:
-            gateway.wait_for_line("CAN socketcan")
-            escs[0].on = True
             in_kernel = 13 if has_other else 7
             time.sleep(1 + in_kernel / rate)  # frames that were under way at the slow-down
             ages, frames = ages_at(far, escs[0], MEASURED_S)
@@ -146,3 +159,30 @@ def test_no_value_is_old_at_the_far_end_of_a_slow_bus(
     assert frames >= 0.95 * MEASURED_S * rate - 1
     assert "restart" not in gateway.log
     assert "no frame can be sent" not in gateway.log
+
+
+@pytest.mark.promise("late-frames")
+@pytest.mark.parametrize("language", ["C", "Python"])
+def test_values_of_a_start_on_an_unplugged_bus_are_not_sent_after_a_restart(
+    language: str, escs: list[PtyPort], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The interface has sent nothing yet. One frame is in the controller, the others wait."""
+    with slow_pair(1) as (near, far):
+        ip("link", "set", far, "down")  # a frame that leaves the queue is not counted as sent
+        let_leave("change", near, 8)
+        gateway = start_gateway(near, escs, tmp_path, language, monkeypatch)
+        try:
+            gateway.wait_for_line("no frame can be sent")
+            ip("link", "set", near, "down")
+            time.sleep(0.5)
+            ip("link", "set", near, "up")
+            time.sleep(4)
+            assert Path("/sys/class/net", near, "statistics/tx_packets").read_text() == "0\n"
+            ip("link", "set", far, "up")
+            let_leave("change", near, 128_000)
+            ages, _ = ages_at(far, escs[0], 2)
+            assert gateway.end() == 0, gateway.log
+        finally:
+            gateway.kill()
+    assert len(ages) > 100
+    assert max(ages) <= TIMEOUT_NS + SLACK_NS

@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Sequence
 
 from kontronik_can_gw.frames import CanFrame, block_of
 from kontronik_can_gw.gateway.transmit_queue import Sent
+from kontronik_can_gw.gateway.under_way import UNCOUNTED
 from kontronik_can_gw.status import CanState
 
 RECEIVE_LIMIT = 64
@@ -99,9 +100,9 @@ class CanPort(ABC):
     def frames_left(self) -> int:
         """Return how many frames have left the interface, including those of other programs.
 
-        0 if the number is not known.
+        ``UNCOUNTED`` if the number is not known.
         """
-        return 0
+        return UNCOUNTED
 
     def frames_queued(self) -> int:
         """Return how many own frames wait in the kernel's queue. 0 if that is not known."""

@@ -16,6 +16,7 @@ from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.errors import RunError
 from kontronik_can_gw.frames import EXTENDED, MAX_EXTENDED_ID, CanFrame, id_and_mask
 from kontronik_can_gw.gateway.transmit_queue import Sent
+from kontronik_can_gw.gateway.under_way import UNCOUNTED
 from kontronik_can_gw.runtime.can.can_port import (
     MAX_STANDARD_ID,
     RECEIVE_LIMIT,
@@ -105,12 +106,10 @@ class SocketCanPort(CanPort):
             self.count_fd = -1
 
     def frames_left(self) -> int:
-        if self.count_fd < 0:
-            return 0
         try:
             return int(os.pread(self.count_fd, _MAX_DIGITS, 0))
-        except (OSError, ValueError):  # the interface was removed
-            return 0
+        except (OSError, ValueError):  # the interface was removed, or its kernel does not count
+            return UNCOUNTED
 
     def frames_queued(self) -> int:
         size = self._meminfo(_QUEUED_BYTES)
