@@ -8,8 +8,6 @@ from kontronik_can_gw.core.header_parts import whole_number
 from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY
 from kontronik_can_gw.times import END_OF_TIME, SECOND
 
-_MAX_MW_NS = MAX_ENERGY * SECOND
-
 
 def check_time(time_ns: int) -> None:
     """Raise ValueError for a time that no gateway has."""
@@ -28,12 +26,16 @@ def check_counters(counters: Sequence[int]) -> None:
             raise ValueError(f"counter {counter}")
 
 
-_LIMITS_OF_ESC = {
-    "energy": _MAX_MW_NS,
-    "run_time": END_OF_TIME - 1,
-    "losses": MAX_COUNT - 1,
+COUNTERS_OF_ESC = {
+    "energy": ("energy_mw_ns", MAX_ENERGY * SECOND),
+    "run_time": ("run_time_ns", END_OF_TIME - 1),
+    "losses": ("losses", MAX_COUNT - 1),
+    "late_frames": ("late_frames", MAX_COUNT - 1),
+    "suspect_frames": ("suspect_frames", MAX_COUNT - 1),
+    "line_errors": ("line_errors", MAX_COUNT - 1),
 }
-LATER_OF_ESC = ("late_frames", "suspect_frames", "line_errors")
+"""Counters in the state of an ESC: their attributes of ``EscTelemetry``, and their limits."""
+_LATER = {"late_frames": 0, "suspect_frames": 0, "line_errors": 0}
 """Counters that captures before 0.6 do not have."""
 _COUNT = (0, MAX_COUNT - 1)
 _LIMITS_OF_WINDOW = (
@@ -65,10 +67,9 @@ _LIMITS_OF_GATEWAY = {
 def check_state(state: Mapping[str, Any]) -> None:
     """Raise HeaderError for a state in a header or a STATE entry that no gateway has."""
     for esc in state.get("escs", ()):
-        for name, high in _LIMITS_OF_ESC.items():
-            whole_number(esc[name], 0, high)
-        for name in LATER_OF_ESC:
-            whole_number(esc.get(name, 0), 0, MAX_COUNT - 1)
+        counters = _LATER | esc
+        for name, (_, high) in COUNTERS_OF_ESC.items():
+            whole_number(counters[name], 0, high)
         if "counters" in esc:
             whole_number(esc["held"], 0, _MAX_HELD)
             for counter in esc["counters"]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from kontronik_can_gw.capture.calls import Recorded, RecordedCall, calls_by_method
 from kontronik_can_gw.capture.format import RECORDED_COUNTERS, EntryKind, numbers_data
+from kontronik_can_gw.capture.limits import COUNTERS_OF_ESC
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.status import GatewayStatus
@@ -135,14 +136,7 @@ def state_of(gateway: RecordedGateway) -> dict[str, Any]:
     """Return the state with which a replay can begin now."""
     escs = []
     for esc in gateway.escs:
-        counters = {
-            "energy": esc.energy_mw_ns,
-            "run_time": esc.run_time_ns,
-            "losses": esc.losses,
-            "late_frames": esc.late_frames,
-            "suspect_frames": esc.suspect_frames,
-            "line_errors": esc.line_errors,
-        }
+        counters = {name: getattr(esc, each) for name, (each, _) in COUNTERS_OF_ESC.items()}
         escs.append(counters | esc.stream_state())
     state = {
         "escs": escs,

@@ -5,7 +5,7 @@ as in a live run, with the recorded times. So frames and times are identical to 
 entry is missing. Nothing waits or is sent.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.capture.calls import CALL_OF, RecordedCall
@@ -17,7 +17,7 @@ from kontronik_can_gw.capture.format import (
     read_json,
     read_numbers,
 )
-from kontronik_can_gw.capture.limits import LATER_OF_ESC, check_counters, check_state, check_time
+from kontronik_can_gw.capture.limits import COUNTERS_OF_ESC, check_counters, check_state, check_time
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
@@ -88,8 +88,7 @@ class Replay:
         if entry.kind == EntryKind.NOT_SENT:
             self._taken = []
             return []
-        found = self._taken
-        self._taken = []
+        found = self.finish()
         try:
             found += self._play(entry)
         except Exception:
@@ -155,8 +154,7 @@ class Replay:
             case EntryKind.COUNTERS:
                 counters = read_numbers(entry.data)
                 check_counters(counters)
-                for name, value in zip(RECORDED_COUNTERS, counters, strict=False):
-                    setattr(self.gateway.status, name, value)
+                self._adopt_counters(counters)
             case EntryKind.LINE_ERRORS:
                 (self.gateway.escs[entry.esc].line_errors,) = read_numbers(entry.data)
             case EntryKind.LOST:
@@ -185,29 +183,23 @@ class Replay:
         """Adopt the counters from before the recording began."""
         states = state.get("escs", ())
         for esc, found in zip(self.gateway.escs, states, strict=False):
-            energy = found["energy"]
-            run_time = found["run_time"]
-            losses = found["losses"]
-            esc.energy_mw_ns = energy
-            esc.run_time_ns = run_time
-            esc.losses = losses
-            for name in LATER_OF_ESC:
-                setattr(esc, name, found.get(name, 0))
+            for name, (attribute, _) in COUNTERS_OF_ESC.items():
+                setattr(esc, attribute, found.get(name, 0))
             if "counters" in found:
                 esc.adopt_stream_state(found["counters"], found["held"], found["window"])
-        self.gateway.core.adopt_places(state.get("messages", ()))
-        for name, value in zip(RECORDED_COUNTERS, state.get("counters", ()), strict=False):
-            setattr(self.gateway.status, name, value)
-        if "started_ns" in state:
-            self.gateway.status.started_ns = state["started_ns"]
-        if "heard_ns" in state:
-            self.gateway.status.heard_ns = state["heard_ns"]
-        if "can_state" in state:
-            self.gateway.status.can_state = CanState(state["can_state"])
-        if state.get("is_held"):
-            self.gateway.is_held = True
-        if state.get("is_limited"):
-            self.gateway.is_limited = True
+        gateway = self.gateway
+        gateway.core.adopt_places(state.get("messages", ()))
+        self._adopt_counters(state.get("counters", ()))
+        status = gateway.status
+        status.started_ns = state.get("started_ns", status.started_ns)
+        status.heard_ns = state.get("heard_ns", status.heard_ns)
+        status.can_state = CanState(state.get("can_state", status.can_state))
+        gateway.is_held |= bool(state.get("is_held"))
+        gateway.is_limited |= bool(state.get("is_limited"))
+
+    def _adopt_counters(self, counters: Sequence[int]) -> None:
+        for name, counter in zip(RECORDED_COUNTERS, counters, strict=False):
+            setattr(self.gateway.status, name, counter)
 
 
 def in_order(frames: list[CanFrame], waiting: TransmitQueue) -> list[CanFrame]:
