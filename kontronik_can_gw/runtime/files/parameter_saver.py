@@ -30,7 +30,7 @@ class ParameterSaver:
         self._escs = escs
         self._store = store
         self._waiting = 0
-        self._last_error = ""
+        self._last_error: str | None = None
 
     def save(self, now: int) -> None:
         """Hand over what is to be stored."""
@@ -53,7 +53,7 @@ class ParameterSaver:
     def _take(self, index: int, error: str | None, now: int) -> None:
         name = self._escs[index].name
         if error is None:
-            self._last_error = ""
+            self._last_error = None
             log.info("%s: parameters stored", name)
         else:
             self._last_error = f"{name}: {error}"

@@ -350,14 +350,7 @@ class Recorder:
             "monotonic_ns": since,
             "wall_ns": wall,
             "devices": self._recorded_devices,
-            "clock": {
-                "synchronized": clock.synchronized,
-                "max_error_s": clock.max_error_s,
-                "hardware": clock.hardware,
-                "steps": clock.steps,
-                "last_step_ns": clock.last_step_ns,
-                "last_step_by_ns": clock.last_step_by_ns,
-            },
+            "clock": clock._asdict(),
         }
         name = f"{self._stamp}-{self._run[:6]}-{part:05d}{SUFFIX}"
         return CapturePart(self._folder / name, json_payload(header), self._clock())

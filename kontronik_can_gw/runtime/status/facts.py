@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kontronik_can_gw import __version__
+from kontronik_can_gw.core.output import NodeState
 from kontronik_can_gw.esc.telemetry import EscTelemetry
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.runtime.system.process import pid_namespace, start_ticks
@@ -19,8 +20,7 @@ class GatewayFacts(NamedTuple):
 
     escs: Sequence[EscTelemetry]
     status: GatewayStatus
-    nodes: Sequence[tuple[int, Any, int]]
-    """As Gateway.node_states."""
+    nodes: Sequence[NodeState]
     outputs: Mapping[str, Any]
     """The facts of the other outputs, by their names."""
     layout: str | None
@@ -65,13 +65,16 @@ class PortFacts(NamedTuple):
 
 
 class CanFacts(NamedTuple):
-    """The state of the CAN interface. The controller's state and counters are in GatewayStatus."""
+    """The state of the CAN interface, with the names of the status document.
+
+    The controller's state and counters are in GatewayStatus.
+    """
 
     interface: str
     channel: str
     bitrate: int | None
     open: bool
-    complaint: str = ""
+    complaint: str | None = None
     stalled: bool = False
     """True if no frame can be sent."""
     slow: bool = False
@@ -82,12 +85,12 @@ class CanFacts(NamedTuple):
 
 
 class StoreFacts(NamedTuple):
-    """The state of the parameter store."""
+    """The state of the parameter store, with the names of the status document."""
 
     waiting: int = 0
     """Number of savings that are not on disk yet."""
-    last_error: str = ""
-    """The reason why the last saving failed. Empty if it succeeded."""
+    last_error: str | None = None
+    """The reason why the last saving failed. None if it succeeded."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ thread can make it. Every value in it was fresh at that moment, or is null.
 
 import json
 from collections.abc import Sequence
-from enum import Enum
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -85,7 +84,9 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
         escs.append(_esc(esc, port, status, now))
     nodes = []
     for port, node in zip(moment.ports, gateway.nodes, strict=False):
-        nodes.append(_node(port.name, *node))
+        node_id = None if node.node_id == UNCONFIGURED else node.node_id
+        state = name_in_words(node.state.name)
+        nodes.append({"esc": port.name, "node_id": node_id, "state": state, "pdos_sent": node.sent})
     document = {
         "format": FORMAT,
         "program": PROGRAM,
@@ -109,26 +110,21 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
             "core": gateway.core,
             "core_reason": gateway.core_note or None,
         },
-        "can": _can(moment.can, status),
+        "can": {
+            **moment.can._asdict(),
+            "state": name_in_words(status.can_state.name),
+            "counters": {name: getattr(status, name) for name in COUNTERS},
+        },
         "escs": escs,
         "nodes": nodes,
         "outputs": gateway.outputs,
-        "store": _store(moment.store),
+        "store": None if moment.store is None else moment.store._asdict(),
         "recording": None if moment.recorder is None else vars(moment.recorder),
         "clock": _clock(moment.clock),
         "log": moment.log_lines[-LOG_LINES:],
         "rates": _rates(moment, before),
     }
     return f'{{"units":{_UNITS},{_encoded(document)[1:]}'
-
-
-def _store(store: StoreFacts | None) -> Document | None:
-    if store is None:
-        return None
-    return {
-        "waiting": store.waiting,
-        "last_error": store.last_error or None,
-    }
 
 
 def _clock(clock: ClockFacts) -> Document:
@@ -144,31 +140,6 @@ def _clock(clock: ClockFacts) -> Document:
     }
 
 
-def _node(esc: str, node_id: int, state: Enum, pdos_sent: int) -> Document:
-    return {
-        "esc": esc,
-        "node_id": None if node_id == UNCONFIGURED else node_id,
-        "state": name_in_words(state.name),
-        "pdos_sent": pdos_sent,
-    }
-
-
-def _can(can: CanFacts, status: GatewayStatus) -> Document:
-    return {
-        "interface": can.interface,
-        "channel": can.channel,
-        "bitrate": can.bitrate,
-        "state": name_in_words(status.can_state.name),
-        "open": can.open,
-        "stalled": can.stalled,
-        "slow": can.slow,
-        "complaint": can.complaint or None,
-        "restart_ms": can.restart_ms,
-        "error_counters": can.error_counters,
-        "counters": {name: getattr(status, name) for name in COUNTERS},
-    }
-
-
 def _rates(moment: Moment, before: Moment | None) -> Document | None:
     """Return the rates per second: frames on the bus, PDOs of each node."""
     if before is None or moment.now <= before.now:
@@ -180,7 +151,7 @@ def _rates(moment: Moment, before: Moment | None) -> Document | None:
     received = new.received_frames - old.received_frames
     pdos_per_s = []
     for new_node, old_node in zip(moment.gateway.nodes, before.gateway.nodes, strict=False):
-        pdos = new_node[2] - old_node[2]
+        pdos = new_node.sent - old_node.sent
         pdos_per_s.append(round(pdos / seconds, 1))
     return {
         "seconds": round(seconds, 3),
@@ -254,7 +225,7 @@ def _port(port: PortFacts, now: int) -> Document:
         "path": port.path,
         "open": port.open,
         "complaint": port.complaint or None,
-        "reopened": max(0, port.reopened),
+        "reopened": port.reopened,
         "lost_for_s": lost_for_s,
         "line_errors": port.line_errors,
     }
