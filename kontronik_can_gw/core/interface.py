@@ -7,14 +7,11 @@ timeouts pass, and ``take`` packs the pending messages. ``now`` is integer nanos
 monotonic clock.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-from kontronik_can_gw.core.output import Owner
-from kontronik_can_gw.core.slots import Slot
-from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry
+from kontronik_can_gw.core.output import OutputHost
 from kontronik_can_gw.frames import CanFrame
-from kontronik_can_gw.status import GatewayStatus
 
 OnEvent = Callable[[int, int, int], None]
 """Takes the ESC, bits of ``telemetry.Event``, and the time."""
@@ -41,7 +38,7 @@ class SchedulePosition(NamedTuple):
     """1 if the deferred frame is the one of a cycle."""
 
 
-class Core(Protocol):
+class Core(OutputHost, Protocol):
     """All that the gateway uses of a core. Calls must be in the order of their times."""
 
     language: str
@@ -51,25 +48,6 @@ class Core(Protocol):
     followers: Sequence[Follower]
     link_changes: list[int]
     """ESCs whose link state, layout or device changed. The owner empties the list."""
-
-    @property
-    def escs(self) -> Sequence[EscTelemetry]:
-        """The state of each ESC."""
-
-    @property
-    def status(self) -> GatewayStatus:
-        """The gateway's own values.
-
-        The runtime writes the values of the CAN interface. Messages with them follow at their next
-        cycle, or at once after ``gateway_changed``.
-        """
-
-    @property
-    def own_ids(self) -> Mapping[int, Owner]:
-        """The ids of the messages. 29-bit ids contain ``EXTENDED``."""
-
-    def slot(self, esc: int) -> Slot:
-        """Return a new slot of an ESC, from which the core sends measurements of an output."""
 
     # --- ESCs
 
@@ -88,9 +66,6 @@ class Core(Protocol):
 
     def port(self, esc: int, is_open: bool, now: int) -> None:
         """Follow an ESC's port that was opened or lost. In both cases its values are dropped."""
-
-    def apply(self, esc: int, settings: EscSettings) -> None:
-        """Give an ESC other settings."""
 
     # --- a replay that begins later in a run
 

@@ -34,7 +34,11 @@ class OutputHost(Protocol):
 
     @property
     def status(self) -> GatewayStatus:
-        """The gateway's own values."""
+        """The gateway's own values.
+
+        The runtime writes the values of the CAN interface. Messages with them follow at their next
+        cycle, or at once after ``Core.gateway_changed``.
+        """
 
     @property
     def own_ids(self) -> Mapping[int, Owner]:

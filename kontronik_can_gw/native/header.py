@@ -122,10 +122,8 @@ def _enumerations() -> list[list[str]]:
 
 
 _ENUMERATIONS = _enumerations()
-KCG: Any = SimpleNamespace()
+KCG: Any = SimpleNamespace(**{name.removeprefix("KCG_"): CONSTANTS[name] for name in CONSTANTS})
 """The constants as attributes, without the prefix."""
-for _name, _number_of in CONSTANTS.items():
-    setattr(KCG, _name.removeprefix("KCG_"), _number_of)
 
 
 def enumeration(first: str, prefix: str = "KCG_") -> list[str]:

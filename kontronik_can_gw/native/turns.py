@@ -47,8 +47,8 @@ class Turns:
         self.times: Any = self._state.times
         self.result: Any = self._state.result
         self.departures: Any = self._state.departures
-        self._reads: Any = self._state.reads
-        self._queue: Any = self._state.queue
+        self.reads: Any = self._state.reads
+        self.queue: Any = self._state.queue
         self._ports: Any = self._state.ports
         self._ports.epoll = -1
         address = c.byref(self._state)
@@ -92,7 +92,7 @@ class Turns:
         """
         if not frames:
             return True
-        queue = self._queue
+        queue = self.queue
         raw = self._raw
         waiting = queue.count
         count = waiting + len(frames)
@@ -115,22 +115,12 @@ class Turns:
         frames.clear()
         return True
 
-    @property
-    def has_unread(self) -> bool:
-        """True if the core was given bytes that it has not processed."""
-        return bool(self._reads.size)
-
     def read(self) -> tuple[int, bytes, int, int]:
         """Return the bytes that the core has not processed, as arguments of Core.receive."""
-        reads = self._reads
+        reads = self.reads
         esc = self._ports.input_of[reads.place[reads.at]]
         data = bytes(reads.data[: reads.size])
         return esc, data, self.times.now, reads.since
-
-    @property
-    def has_advanced(self) -> bool:
-        """True if kcg_advance was called in the iteration."""
-        return bool(self._reads.has_advanced)
 
     def ready(self) -> list[tuple[int, int]]:
         """Return the descriptors that are ready, with the events of poll."""
@@ -138,14 +128,9 @@ class Turns:
         ready = [each for each in ports.fds[: ports.count] if each.revents]
         return [(each.fd, each.revents) for each in ready]
 
-    @property
-    def full_since(self) -> int:
-        """Time in ns since which the bus has taken no frame."""
-        return int(self._queue.full_since)
-
     def unsent(self) -> list[CanFrame]:
         """Return the frames that the bus did not take, in their order."""
-        queue = self._queue
+        queue = self.queue
         if not queue.count:
             return []
         frames = frames_in(self._raw, _FRAMES, queue.count)

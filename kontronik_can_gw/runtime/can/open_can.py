@@ -100,10 +100,6 @@ class OwnFrames:
                 self._expected.popleft()
             self._expected.append((now, _as_received(frame)))
 
-    def discard(self, frame: CanFrame) -> None:
-        """No longer expect a frame, because it could not be sent."""
-        self.is_own(frame)
-
     def is_own(self, frame: CanFrame) -> bool:
         """Return True if a received frame is our own. Returns True once for each sent frame."""
         received = _as_received(frame)
@@ -211,7 +207,7 @@ class DriverPort(CanPort):
                 self._own_frames.add(frame, clock())
             answer = self._send_message(frame)
             if self._own_frames is not None and answer is not Sent.OK:
-                self._own_frames.discard(frame)
+                self._own_frames.is_own(frame)  # no longer expected
             if answer is not Sent.OK:
                 return count, answer
         return len(frames), Sent.OK

@@ -175,9 +175,7 @@ class Ring:
                 segment = before or self._segments[-1]
                 self._append(segment, remark, packed(data_payload(remark)))
             self._append(self._segments[-1], part, payload)
-            if not holds:
-                lost += self._drop_old()
-            while self.bytes > self._max_bytes:
+            while self.bytes > self._max_bytes or (not holds and self._is_first_old()):
                 dropped = self._drop_segment()
                 lost += sum(chunk.entries for chunk in dropped)
                 self.is_cut = not self._segments
@@ -192,13 +190,9 @@ class Ring:
         self.bytes += len(payload.stored)
         self.newest_ns = items[-1][0]
 
-    def _drop_old(self) -> int:
-        """Drop old segments. Return the number of their entries that were not written."""
+    def _is_first_old(self) -> bool:
         segments = self._segments
-        lost = 0
-        while len(segments) > 1 and segments[1].begin_ns <= self.newest_ns - self._keep_ns:
-            lost += sum(chunk.entries for chunk in self._drop_segment())
-        return lost
+        return len(segments) > 1 and segments[1].begin_ns <= self.newest_ns - self._keep_ns
 
     def _drop_segment(self) -> list[Chunk]:
         """Drop the oldest segment. Return its chunks that were not written."""
