@@ -102,31 +102,19 @@ class _Message(Traits):
         self.last: dict[int, CanFrame] = {}
         """If it is sent on change: the last frame of each group, with alive counter 0."""
         self.why = 0
-        self._sent_ns = -NEVER
-        self._cycle_due = first_cycle if plan.cycle_ns else NEVER
-        self._deferred_until = NEVER
-        self._is_cycle_deferred = False
-
-    @property
-    def due(self) -> int:
-        """The time at which ``take_due`` must be called."""
-        return min(self._cycle_due, self._deferred_until)
+        self.sent_ns = -NEVER
+        self.cycle_due = first_cycle if plan.cycle_ns else NEVER
+        self.deferred_until = NEVER
+        self.is_cycle_deferred = False
 
     def may_go(self, now: int) -> bool:
         """Return True if the minimum delay time to its last frame is over."""
-        return now >= self._sent_ns + self.plan.delay_ns
+        return now >= self.sent_ns + self.plan.delay_ns
 
     def defer(self) -> None:
         """Delay it until its minimum delay time is over."""
-        if self._deferred_until == NEVER:
-            self._deferred_until = self._sent_ns + self.plan.delay_ns
-
-    def sent(self, now: int) -> None:
-        """Note that a frame of it was sent. Only further groups remain to be sent."""
-        self._sent_ns = now
-        self._is_cycle_deferred = False
-        distance = max(self.plan.delay_ns, _MIN_DISTANCE_NS)
-        self._deferred_until = now + distance if self.pages_to_send else NEVER
+        if self.deferred_until == NEVER:
+            self.deferred_until = self.sent_ns + self.plan.delay_ns
 
     def take_due(self, now: int) -> tuple[int, int]:
         """Return the time at which it became due and the reasons, or NEVER and 0.
@@ -136,32 +124,32 @@ class _Message(Traits):
         """
         when = NEVER
         why = 0
-        if self._deferred_until <= now:
-            when = self._deferred_until
+        if self.deferred_until <= now:
+            when = self.deferred_until
             why = _REQUEST
-            if self._is_cycle_deferred:
+            if self.is_cycle_deferred:
                 why |= _CYCLE
-            self._deferred_until = NEVER
-            self._is_cycle_deferred = False
-        start = self._cycle_due
+            self.deferred_until = NEVER
+            self.is_cycle_deferred = False
+        start = self.cycle_due
         if start <= now:
             cycle = self.plan.cycle_ns
-            self._cycle_due += cycle * ((now - start) // cycle + 1)
+            self.cycle_due += cycle * ((now - start) // cycle + 1)
             if self.may_go(now):
                 return min(when, start), why | _CYCLE
             self.defer()
-            self._is_cycle_deferred = True
+            self.is_cycle_deferred = True
         return when, why
 
     def schedule_place(self) -> SchedulePosition:
         """Return its place in the schedule."""
-        deferred_until = -1 if self._deferred_until == NEVER else self._deferred_until
+        deferred_until = -1 if self.deferred_until == NEVER else self.deferred_until
         return SchedulePosition(
             self.alive,
             self.place,
-            max(-1, self._sent_ns),
+            max(-1, self.sent_ns),
             deferred_until,
-            int(self._is_cycle_deferred),
+            int(self.is_cycle_deferred),
         )
 
     def adopt(self, place: SchedulePosition) -> None:
@@ -169,18 +157,9 @@ class _Message(Traits):
         self.alive = place.alive % max(1, self.alive_modulus)
         self.place = place.page % len(self.plan.pages)
         if place.sent_ns >= 0:
-            self._sent_ns = place.sent_ns
-        self._deferred_until = NEVER if place.deferred_until < 0 else place.deferred_until
-        self._is_cycle_deferred = bool(place.cycle_deferred)
-
-    def follows(self, events: int, up: bool) -> bool:
-        """Return True if the message is sent for these events of an ESC.
-
-        ``up`` is True if the ESC's live data is fresh.
-        """
-        if up and self.by_event and self.triggers & Event.LIVE:
-            events &= ~Event.LINK  # each live frame causes it already
-        return bool(self.triggers & events)
+            self.sent_ns = place.sent_ns
+        self.deferred_until = NEVER if place.deferred_until < 0 else place.deferred_until
+        self.is_cycle_deferred = bool(place.cycle_deferred)
 
     def add_all_pages(self) -> None:
         """Send all groups, if there are several."""
@@ -192,21 +171,6 @@ class _Message(Traits):
         if self.is_paged:
             self.pages_to_send.add(self.place)
             self.place = (self.place + 1) % len(self.plan.pages)
-
-    def take_place(self) -> int:
-        """Return the place of the group to send, and remove it from those to send.
-
-        It is the first of them, counted from the group whose turn is next.
-        """
-        if not self.is_paged:
-            return 0
-        if not self.pages_to_send:
-            self.turn_page()
-        count = len(self.plan.pages)
-        distance = min([(place - self.place) % count for place in self.pages_to_send])
-        place = (self.place + distance) % count
-        self.pages_to_send.remove(place)
-        return place
 
 
 def own_ids(layout: MessageLayout) -> dict[int, Owner]:
@@ -256,7 +220,8 @@ class Messages:
     @property
     def next_due(self) -> int:
         """The time at which ``advance`` must be called, or NEVER."""
-        return min([message.due for message in self._timed], default=NEVER)
+        dues = [min(each.cycle_due, each.deferred_until) for each in self._timed]
+        return min(dues, default=NEVER)
 
     # --- a replay that begins later in a run
 
@@ -276,11 +241,14 @@ class Messages:
         if self._is_quiet:
             return
         state = self._escs[esc]
-        up = state.live is not None
+        is_live = state.live is not None
         # Live or info data have ended. No later event sends the remaining groups.
-        has_ended = not up or (events & Event.INFO and state.info is None)
+        has_ended = not is_live or (events & Event.INFO and state.info is None)
         for message in self._of_esc[esc]:
-            if message.follows(events, up):
+            causes = message.triggers
+            if is_live and message.by_event and causes & Event.LIVE:
+                causes &= ~Event.LINK  # each live frame causes it already
+            if causes & events:
                 if has_ended and message.by_event:
                     message.add_all_pages()
                 self._request(message, now)
@@ -360,49 +328,37 @@ class Messages:
 
     # --- frames
 
-    def take(self, now: int) -> list[CanFrame]:
-        """Return the frames of the pending messages, with the values of ``now``."""
-        pending = self.pending
-        self.pending = {}
+    def take(self, now: int, most: int | None = None) -> list[CanFrame]:
+        """Return the frames of the pending messages, with the values of ``now``.
+
+        At most ``most`` messages are taken, those that became due first.
+        """
         frames: list[CanFrame] = []
-        for index, _ in sorted(pending.items(), key=itemgetter(1, 0)):
+        for index, _ in sorted(self.pending.items(), key=itemgetter(1, 0))[:most]:
+            del self.pending[index]
             message = self._messages[index]
             why = message.why
             message.why = 0
-            if self._prepare(message, why, now):
+            if message.is_silent_on_loss:
+                has_telemetry = any(self._escs[esc].up for esc in message.plan.escs)
+                if not has_telemetry:
+                    message.pages_to_send.clear()
+                    continue
+            # A request sends the groups that have changed, the end of a cycle the next one.
+            is_sent = bool(why & _REQUEST) and self._note_news(message, now)
+            if why & _CYCLE:
+                message.turn_page()
+                is_sent = True
+            if is_sent:
                 frames.append(self._frame(message, now))
-                while (self._is_stopping or self._is_quiet) and message.pages_to_send:
-                    frames.append(self._frame(message, now))
+            while is_sent and (self._is_stopping or self._is_quiet) and message.pages_to_send:
+                frames.append(self._frame(message, now))
         return frames
 
     @property
     def pending_since(self) -> int:
         """The time since which the oldest message is pending, or NEVER."""
         return min(self.pending.values(), default=NEVER)
-
-    def take_oldest(self, now: int) -> list[CanFrame]:
-        """Return the frames of the message that became due first."""
-        others = self.pending
-        index = min(others, key=lambda each: (others[each], each))
-        self.pending = {index: others.pop(index)}
-        frames = self.take(now)
-        self.pending = others | self.pending
-        return frames
-
-    def _prepare(self, message: _Message, why: int, now: int) -> bool:
-        """Return True if a pending message is sent, and choose its groups.
-
-        They are the changed ones if it was requested, and the next one if its cycle is over.
-        """
-        if message.is_silent_on_loss:
-            has_telemetry = any(self._escs[esc].up for esc in message.plan.escs)
-            if not has_telemetry:
-                message.pages_to_send.clear()
-                return False
-        is_news = bool(why & _REQUEST) and self._note_news(message, now)
-        if why & _CYCLE:
-            message.turn_page()
-        return is_news or bool(why & _CYCLE)
 
     def _note_news(self, message: _Message, now: int) -> bool:
         """Return False if a message is sent on change and has not changed.
@@ -422,11 +378,23 @@ class Messages:
 
     def _frame(self, message: _Message, now: int) -> CanFrame:
         """Return the frame of the next group, and note that it was sent."""
-        place = message.take_place()
+        place = 0
+        if message.is_paged:
+            if not message.pages_to_send:
+                message.turn_page()
+            # The first group to send, counted from the one whose turn is next.
+            count = len(message.plan.pages)
+            distance = min([(each - message.place) % count for each in message.pages_to_send])
+            place = (message.place + distance) % count
+            message.pages_to_send.remove(place)
         frame = message.frame(self._escs, self._gateway, now, message.alive, place)
         if message.on_change:
             message.last[place] = message.frame(self._escs, self._gateway, now, 0, place)
         if message.alive_modulus:
             message.alive = (message.alive + 1) % message.alive_modulus
-        message.sent(now)
+        message.sent_ns = now
+        message.is_cycle_deferred = False
+        message.deferred_until = NEVER
+        if message.pages_to_send:
+            message.deferred_until = now + max(message.plan.delay_ns, _MIN_DISTANCE_NS)
         return frame

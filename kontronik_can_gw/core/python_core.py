@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from kontronik_can_gw.core.esc_stream import EscStream
-from kontronik_can_gw.core.interface import Follower, SchedulePosition
+from kontronik_can_gw.core.interface import Follower
 from kontronik_can_gw.core.messages import Messages, own_ids
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.core.slots import Slots
@@ -32,6 +32,7 @@ class PythonCore:
         self.slot = self.slots.add
         self.own_ids = own_ids(settings.layout)
         self.gateway_changed = self.messages.on_gateway_change
+        self.places = self.messages.places
         self.repeat = self.messages.repeat
         self.stop = self.messages.stop
         self.followers: Sequence[Follower] = ()
@@ -74,9 +75,6 @@ class PythonCore:
         self._next_expiry = 0
 
     # --- a replay that begins later in a run
-
-    def places(self) -> list[SchedulePosition]:
-        return self.messages.places()
 
     def adopt_places(self, places: Sequence[Sequence[int]]) -> None:
         self.messages.adopt_places(places)
@@ -171,7 +169,7 @@ class PythonCore:
 
     @property
     def is_pending(self) -> bool:
-        return bool(self.messages.pending) or self.slots.is_pending
+        return bool(self.messages.pending or self.slots.pending)
 
     def take(self, now: int) -> list[CanFrame]:
         frames: list[CanFrame] = []
@@ -181,8 +179,8 @@ class PythonCore:
 
     def take_oldest(self, now: int) -> list[CanFrame]:
         if self.slots.pending_since <= self.messages.pending_since:
-            return self.slots.take_oldest(now)
-        return self.messages.take_oldest(now)
+            return self.slots.take(now, 1)[0].frames
+        return self.messages.take(now, 1)
 
     def _report(self, esc: int, events: int, now: int) -> None:
         """Pass events of an ESC to messages, followers and slots."""

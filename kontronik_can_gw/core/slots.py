@@ -186,7 +186,7 @@ class PythonSlot:
         until = self._last_ns + settings.inhibit_ns
         if now >= until:
             self._deferred_until = NEVER
-            owner.mark_pending(self, now)
+            owner.pending[self.place] = now
         elif self._deferred_until == NEVER and not settings.plan.is_paced:
             # A paced slot waits for the next event or its timer instead.
             self._deferred_until = until
@@ -194,7 +194,7 @@ class PythonSlot:
 
     def send(self, now: int) -> None:
         if self._is_started and self._settings is not None and not self._owner.is_quiet:
-            self._owner.mark_pending(self, now)
+            self._owner.pending.setdefault(self.place, now)
 
     def on_event(self, now: int) -> None:
         """Handle an event of ``triggers``."""
@@ -328,10 +328,6 @@ class Slots:
             if events & slot.triggers:
                 slot.on_event(now)
 
-    def mark_pending(self, slot: PythonSlot, now: int) -> None:
-        """Mark a slot as pending."""
-        self.pending.setdefault(slot.place, now)
-
     def set_quiet(self, is_quiet: bool) -> None:
         """Begin or end quiet mode. Slots that are pending at its begin are not sent."""
         self.is_quiet = is_quiet
@@ -358,32 +354,15 @@ class Slots:
                         slot.advance(now)
 
     @property
-    def is_pending(self) -> bool:
-        """True if ``take`` would return frames."""
-        return bool(self.pending)
-
-    @property
     def pending_since(self) -> int:
         """The time since which the oldest slot is pending, or NEVER."""
         return min(self.pending.values(), default=NEVER)
 
-    def take_oldest(self, now: int) -> list[CanFrame]:
-        """Return the frames of the slot that became due first."""
-        others = self.pending
-        place = min(others, key=lambda each: (others[each], each))
-        self.pending = {place: others.pop(place)}
-        (slot,) = self.take(now)
-        self.pending = others | self.pending
-        return slot.frames
-
-    def take(self, now: int) -> list[PendingSlot]:
-        """Return the pending slots in their order, each with its frames."""
-        if not self.pending:
-            return []
-        pending = self.pending
-        self.pending = {}
+    def take(self, now: int, most: int | None = None) -> list[PendingSlot]:
+        """Return the pending slots in their order, at most ``most``, each with its frames."""
         found = []
-        for key, since in sorted(pending.items(), key=itemgetter(1, 0)):
+        for key, since in sorted(self.pending.items(), key=itemgetter(1, 0))[:most]:
+            del self.pending[key]
             esc, number = key
             frames = self._of[esc][number].frames(now)
             found.append(PendingSlot(since, key, frames))

@@ -5,11 +5,13 @@ must do in this order. Between two events these questions are answered:
 
 1. ``is_open``: may answers be handed over? ``room``: how many frames, measurements included?
 2. ``wants_first_frame``: must a frame without measurements be handed over now?
-3. ``must_look``: must the interface's count be passed to ``look`` now?
+3. ``look_due``: when must the interface's count be passed to ``look``?
 4. ``due``: when must ``advance`` be called? Earlier calls do no harm. A later call acts late.
 
 The states and events are the table ``TABLE`` of gate_table.py. docs/design.md shows it.
 """
+
+from typing import Any
 
 from kontronik_can_gw.gateway.gate_rules import CHANGES, TESTS
 from kontronik_can_gw.gateway.gate_state import GateState, Limit
@@ -29,7 +31,6 @@ from kontronik_can_gw.times import MS, NEVER
 
 POLL_NS = 2 * MS
 """Time between two looks while frames are limited, and between two attempts on a busy port."""
-_OPEN = State.OPEN  # an enumeration's members are slow to look up
 _NO_ROWS: tuple[Row, ...] = ()
 
 
@@ -109,7 +110,7 @@ class Gate(GateState):
             self.still_since = now
             self.look_due = min(self.look_due, now + self.period_ns)
         under_way.add(frames, now)
-        if self.state is not _OPEN:
+        if self.state is not State.OPEN:
             self._step(Event.ACCEPTED, now)
 
     def refused(self, is_full: bool, now: int) -> None:
@@ -169,22 +170,11 @@ class Gate(GateState):
         self._step(Event.MOVED if has_moved else Event.STILL, now)
         self.look_due = self._next_look(now)
 
-    def adopt(
-        self,
-        count: int,
-        accepted: int,
-        older: int,
-        newer: int,
-        checked: int,
-        still_since: int,
-        look_due: int,
-        now: int,
-    ) -> None:
-        """Take over the frames of iterations in C: see ``UnderWay.adopt``."""
-        self.under_way.count = count
-        self.under_way.adopt(accepted, older, newer, checked, now)
-        self.still_since = still_since
-        self.look_due = look_due
+    def adopt(self, departures: Any, now: int) -> None:
+        """Take over the frames of iterations in C (``kcg_departures`` of native/linux.h)."""
+        self.under_way.adopt(departures, now)
+        self.still_since = departures.still_since
+        self.look_due = departures.check_due
 
     def request(self, now: int) -> None:
         """Note that outputs have made answers while frames are held."""

@@ -114,11 +114,6 @@ class GateState:
         return self.timeout_ns // 4
 
     @property
-    def is_limited(self) -> bool:
-        """True if the number of frames under way is limited."""
-        return self.state is State.SLOW
-
-    @property
     def may_ask(self) -> bool:
         """True if a restart is requested after the pause."""
         if not self.restart.after_ns:
@@ -146,11 +141,6 @@ class GateState:
         return self.timeout_ns // 8
 
     @property
-    def has_proof(self) -> bool:
-        """True if the interface has sent a frame since its last failure."""
-        return self.state in PASSING and self.state is not State.UNPROVEN
-
-    @property
     def may_run_in_c(self) -> bool:
         """True if no frame is held, limited or refused."""
         is_free = self.state is State.OPEN or self.state is State.QUIET
@@ -160,7 +150,7 @@ class GateState:
         """Return how many frames may be handed over now."""
         if self.state not in PASSING:
             return 0
-        if not self.is_limited:
+        if self.state is not State.SLOW:
             return UNLIMITED
         if self.is_late(now):
             return 0
@@ -173,10 +163,6 @@ class GateState:
     def wants_first_frame(self, now: int) -> bool:
         """Return True if a frame without measurements must be handed over now."""
         return self.state is State.BLOCKED and self.may_try(now)
-
-    def must_look(self, now: int) -> bool:
-        """Return True if the interface's count must be passed to ``look``."""
-        return now >= self.look_due
 
     @property
     def due(self) -> int:

@@ -47,7 +47,6 @@ class Gateway(FrameSource):
         self.escs = self.core.escs
         self.status = self.core.status
         self.node_outputs = [each for each in self.outputs if isinstance(each, NodeOutput)]
-        self.has_outputs = bool(self.outputs)
         """False if only messages are sent. Then the ids to receive never change."""
         self.core.followers = [
             *[Follower(each.events, each.on_event) for each in self.outputs],
@@ -217,7 +216,8 @@ class Gateway(FrameSource):
         """
         if with_core:
             self.core.advance(now)
-        self.conflicts.advance(now)
+        if now >= self.conflicts.due:
+            self.conflicts.advance(now)
         if self._has_discarded:
             self._has_discarded = False
             self.core.repeat(now)
@@ -229,7 +229,7 @@ class Gateway(FrameSource):
     def next_deadline(self, with_core: bool = True) -> int:
         """Return the time at which ``advance`` must be called. Earlier calls do no harm."""
         due = self.core.next_deadline() if with_core else NEVER
-        due = min(due, self.conflicts.next_deadline())
+        due = min(due, self.conflicts.due)
         for output in self.outputs:
             due = min(due, output.next_deadline())
         return due

@@ -51,6 +51,8 @@ class IdConflicts:
         self._present: dict[int, Conflict] = {}
         self._news: list[Conflict] = []
         self._echoes_until = 0
+        self.due = NEVER
+        """Time of the next call of ``advance``."""
 
     @property
     def receive_ids(self) -> frozenset[int]:
@@ -110,12 +112,11 @@ class IdConflicts:
             self._report(conflict, True, now)
         conflict.count += 1
         conflict.last = now
+        self.due = min(self.due, now + _OVER_NS + 1)
         return True
 
     def advance(self, now: int) -> None:
         """End the conflicts without a frame for ten seconds."""
-        if not self._present:
-            return
         ended = [each for each in self._present.values() if now - each.last > _OVER_NS]
         for conflict in ended:
             conflict.is_over = True
@@ -125,13 +126,8 @@ class IdConflicts:
             others = [(each.output, each.node) for each in self._present.values()]
             if node not in others:
                 self._report(conflict, False, now)
-
-    def next_deadline(self) -> int:
-        """Return the earliest time at which ``advance`` can have something to do."""
-        if not self._present:
-            return NEVER
-        oldest = min([each.last for each in self._present.values()])
-        return oldest + _OVER_NS + 1
+        lasts = [each.last for each in self._present.values()]
+        self.due = min(lasts, default=NEVER) + _OVER_NS + 1
 
     def take(self) -> list[Conflict]:
         """Return the conflicts that began or ended since the last call."""

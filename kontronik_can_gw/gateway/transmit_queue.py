@@ -4,17 +4,17 @@ For each CAN id and multiplexer group the newest frame wins. A frame with the fl
 as an answer of a CANopen node, is never replaced.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from enum import Enum
 from itertools import pairwise
 from operator import itemgetter
 
 from kontronik_can_gw.frames import FIRST_PART, PARTS, CanFrame
+from kontronik_can_gw.status import GatewayStatus
 
 QUEUE_LENGTH = 2048
 _place = CanFrame._fields.index
 _key_of = itemgetter(_place("can_id"), _place("extended"), _place("page"))
-_is_queued = itemgetter(_place("queued"))
 
 
 class Sent(Enum):
@@ -47,7 +47,13 @@ class TransmitQueue:
        bus.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, counters: GatewayStatus | None = None) -> None:
+        self.counters = counters or GatewayStatus()
+        """Counts the measurements and other frames that were not sent.
+
+        A measurement is replaced by a newer one or, as a part of a transfer, by an older one. Other
+        frames are dropped if the queue is full. ``drop_measurements`` and ``clear`` count, too.
+        """
         self._waiting: dict[tuple[int, ...], CanFrame] = {}
         """The frames in the order of ``put_all``. The key of a queued frame is a unique number.
 
@@ -59,67 +65,42 @@ class TransmitQueue:
         self._has_leftovers = False
         """True if the interface took only some of the waiting frames."""
         self._queue_has_turn = True
-        self.replaced = 0
-        """Number of frames that were not sent: replaced by a newer one, dropped in favour of an
-        older transfer, or cleared. The owner may reset it.
-        """
-        self.dropped = 0
-        """Number of queued frames that were lost because the queue was full, or cleared.
-
-        The owner may reset it.
-        """
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def put_all(self, frames: Sequence[CanFrame]) -> int:
-        """Add frames. Return how many frames were lost.
+    def put_all(self, frames: Sequence[CanFrame]) -> None:
+        """Add frames.
 
         A frame is lost if it is replaced, if an older transfer is half sent, or if it is queued and
         ``QUEUE_LENGTH`` queued frames wait already.
         """
-        waiting = self._waiting
-        count = len(waiting) + len(frames)
+        count = len(self._waiting) + len(frames)
         dropped = 0
-        self._has_leftovers = self._has_leftovers and bool(waiting)
-        if any(map(_is_queued, frames)):
-            dropped = self._put_with_queued(frames)
-        else:
-            if waiting:
-                frames = [frame for frame in frames if not self._has_begun(frame)]
-                for frame in frames:
-                    self._move_up_pages(frame)
-                waiting = self._waiting
-            waiting.update(zip(map(_key_of, frames), frames, strict=True))
-        lost = count - len(waiting)
-        self.dropped += dropped
-        self.replaced += lost - dropped
-        return lost
-
-    def _put_with_queued(self, frames: Iterable[CanFrame]) -> int:
-        """Add frames, some of them queued. Return how many queued frames found no room."""
-        dropped = 0
+        self._has_leftovers = self._has_leftovers and bool(self._waiting)
         for frame in frames:
             if not frame.queued:
-                if not self._has_begun(frame):
-                    self._move_up_pages(frame)
-                    self._waiting[_key_of(frame)] = frame
+                key = _key_of(frame)
+                if frame.page >= FIRST_PART and self._has_begun(frame):
+                    continue
+                if frame.page < FIRST_PART and key in self._waiting:
+                    self._move_up_pages(key)
+                self._waiting[key] = frame
             elif self._queued < QUEUE_LENGTH:
                 self._waiting[(self._next_number,)] = frame
                 self._next_number += 1
                 self._queued += 1
             else:
                 dropped += 1
-        return dropped
+        if count > len(self._waiting):
+            self.counters.dropped_frames += dropped
+            self.counters.replaced_frames += count - len(self._waiting) - dropped
 
-    def _move_up_pages(self, frame: CanFrame) -> None:
+    def _move_up_pages(self, own: tuple[int, ...]) -> None:
         """Give the waiting frame of an id and group the last place of the message's groups.
 
-        The groups behind it move up. Nothing changes if it does not wait, or is the last one.
+        The groups behind it move up. Nothing changes if it is the last one.
         """
-        own = _key_of(frame)
-        if frame.page >= FIRST_PART or own not in self._waiting:
-            return
         items = [*self._waiting.items()]
         places = [place for place, (key, _) in enumerate(items) if key[:2] == own[:2]]
         keys = [items[place][0] for place in places]
@@ -133,13 +114,11 @@ class TransmitQueue:
         self._waiting = dict(items)
 
     def _has_begun(self, frame: CanFrame) -> bool:
-        """Return True if a frame belongs to a transfer whose predecessor is half sent.
+        """Return True if the predecessor of a frame's transfer is half sent.
 
         The first part of the predecessor is no longer in the queue, but later parts still wait. The
         parts of a transfer have ``PARTS`` consecutive groups.
         """
-        if frame.page < FIRST_PART:
-            return False
         first = frame.page - (frame.page - FIRST_PART) % PARTS
         waiting = []
         for page in range(first, first + PARTS):
@@ -203,7 +182,7 @@ class TransmitQueue:
     def drop_measurements(self) -> bool:
         """Drop all frames that are not queued. Return True if there were any."""
         count = len(self._waiting) - self._queued
-        self.replaced += count
+        self.counters.replaced_frames += count
         measurements = [key for key, frame in self._waiting.items() if not frame.queued]
         for key in measurements:
             del self._waiting[key]
@@ -212,7 +191,7 @@ class TransmitQueue:
     def clear(self) -> None:
         """Drop all frames, because they would be too old when they could be sent."""
         self.drop_measurements()
-        self.dropped += self._queued
+        self.counters.dropped_frames += self._queued
         self._waiting.clear()
         self._queued = 0
         self._has_leftovers = False

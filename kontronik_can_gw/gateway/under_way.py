@@ -1,6 +1,7 @@
 """The frames that a CAN interface has accepted and that have not left it. Pure."""
 
 from collections import deque
+from typing import Any
 
 from kontronik_can_gw.gateway.gate_table import UNLIMITED
 from kontronik_can_gw.times import NEVER
@@ -60,18 +61,20 @@ class UnderWay:
         self.looked = now
         return bool(moved)
 
-    def adopt(self, accepted: int, older: int, newer: int, checked: int, now: int) -> None:
+    def adopt(self, departures: Any, now: int) -> None:
         """Take over the frames of iterations in C.
 
         ``accepted`` frames were accepted since the last call. ``older`` and ``newer`` of all
         frames are under way, and were accepted before and after the check at ``checked``.
         """
-        added = min(accepted, older + newer)
-        added_newer = min(newer, added)
-        self._remove(max(0, self.frames - (older + newer - added)))
-        self.add(added - added_newer, checked)
+        frames = departures.older + departures.newer
+        added = min(departures.accepted, frames)
+        added_newer = min(departures.newer, added)
+        self.count = departures.count
+        self._remove(max(0, self.frames - (frames - added)))
+        self.looked = departures.checked
+        self.add(added - added_newer, self.looked)
         self.add(added_newer, now)
-        self.looked = checked
 
     def _remove(self, frames: int) -> None:
         accepted = self._accepted

@@ -240,7 +240,7 @@ class NativeCore:
 
     def deadline_in_python(self) -> int:
         """Return the deadline of ``advance_in_python``. 0 while one of its slots is pending."""
-        return 0 if self._slots.is_pending else self._slots.next_deadline()
+        return 0 if self._slots.pending else self._slots.next_deadline()
 
     def turns(self) -> Turns:
         """Return the iterations of a loop with this core."""
@@ -257,7 +257,7 @@ class NativeCore:
 
     @property
     def is_pending(self) -> bool:
-        return bool(self.state.pendings) or self._slots.is_pending
+        return bool(self.state.pendings or self._slots.pending)
 
     def take(self, now: int) -> list[CanFrame]:
         frames: list[CanFrame] = []
@@ -279,7 +279,7 @@ class NativeCore:
         ages = [(self.sending[index].since, index < messages, index) for index in pending]
         since, _, index = min(ages, default=(NEVER, False, 0))
         if self._slots.pending_since <= since:
-            return self._slots.take_oldest(now)
+            return self._slots.take(now, 1)[0].frames
         others = [each for each in pending if each != index]
         self.pending[0] = index
         self.state.pendings = 1

@@ -83,6 +83,7 @@ class Housekeeping:
         self._alive_due = 0 if notifier.watchdog_ns is not None else None
         """Time of the next keep-alive. None if the service manager expects none."""
         self._notify_due = 0
+        self._is_ready = False
         self._collect_due: int | None = None
         self._process = ProcessFacts()
         self._process_due = 0
@@ -226,11 +227,21 @@ class Housekeeping:
         ]
         return "; ".join(words)
 
+    def report_ready(self) -> None:
+        """Report once to the service manager that the gateway runs.
+
+        An interface whose failure ends the gateway must be open before.
+        """
+        if not (self._is_ready or self._can.must_open):
+            self._is_ready = True
+            self._notifier.ready(self.status_words())
+
     def _notify(self, now: int) -> None:
         """Send a status line to the service manager, and a keep-alive if no port is stuck.
 
         A port that the loop does not serve in time is a reason to restart the process.
         """
+        self.report_ready()
         if now >= self._notify_due and self._notifier.is_present:
             self._notify_due = now + STATUS_NS
             self._notifier.status(self.status_words())
@@ -264,7 +275,7 @@ def _can_facts(can: CanLink, conditions: FaultLog) -> CanFacts:
         channel=config.channel,
         bitrate=bitrate or None,
         open=can.is_open,
-        complaint=next(filter(None, map(conditions.reason, faults)), ""),
+        complaint=next(filter(None, map(conditions.reason, faults)), None),
         stalled=can.gate.is_stalled,
         slow=can.gate.is_slow,
         restart_ms=known.restart_ms,

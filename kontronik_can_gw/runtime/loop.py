@@ -26,7 +26,7 @@ from kontronik_can_gw.runtime.status.statistics import Statistics
 from kontronik_can_gw.runtime.system.fault_log import FaultLog, duration
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
 from kontronik_can_gw.runtime.system.worker import Handover
-from kontronik_can_gw.times import SECOND
+from kontronik_can_gw.times import MS, SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.files.recorder import Recorder
@@ -61,13 +61,11 @@ class Loop:
         self._clock = clock
         self._is_patient = wait_for_devices
         self._store = store
-        self._notifier = notifier or Notifier({})
         self._statistics = statistics
         self._recorder = recorder
         self._revision = 0
         self._is_stopping = False
         self._reason = "stopped"
-        self._is_ready = False
         self._poller = poller or Poller(clock)
         self._native = cast("NativePoller", poller) if self._poller.is_native else None
         self._lost: set[EscPort] = set()
@@ -83,7 +81,7 @@ class Loop:
             self.can,
             self.conditions,
             self._saver,
-            notifier=self._notifier,
+            notifier=notifier or Notifier({}),
             statistics=self._statistics,
             recorder=recorder,
             program=program or ProgramFacts(""),
@@ -152,16 +150,7 @@ class Loop:
         self.gateway.start(now, self.can.is_open)
         self.can.follow_ids()  # first, because a master may send requests after the boot-up message
         self.can.transmit(now)
-        self._report_ready()
-
-    def _report_ready(self) -> None:
-        """Report once to the service manager that the gateway runs.
-
-        An interface whose failure ends the gateway must be open before.
-        """
-        if not (self._is_ready or self.can.must_open):
-            self._is_ready = True
-            self._notifier.ready(self._housekeeping.status_words())
+        self._housekeeping.report_ready()
 
     def turn(self) -> None:
         """Wait until a descriptor is ready or work is due, and do the work."""
@@ -191,8 +180,10 @@ class Loop:
         early by this quarter of the timeout.
         """
         gateway = self.gateway
-        own_due = self._own_deadline()
-        period = self.can.transmitter.max_wait_ns()
+        own_due = min(
+            self.can.due, self._housekeeping.wake_due, *[esc.retry.due for esc in self._lost]
+        )
+        period = self.can.gate.quarter_ns - MS  # a wait is rounded up to a millisecond
         if gateway.status.is_quiet:
             period = _QUIET_PERIOD_NS
         if self._native is not None and self._native.can_run(self.can):
@@ -212,16 +203,14 @@ class Loop:
             handler(now, events)
         if self._lost or can.port is None or now >= can.controller.due:
             now = self._reopen(now)
-        has_outputs = gateway.has_outputs
-        if has_outputs:
+        if gateway.outputs:
             # First, so that its answers are sent in this iteration, as in a replay.
             self._saver.save(now)
         can.look(now)
         gateway.advance(now)
-        if has_outputs:
+        if gateway.outputs:
             self._follow_outputs(now)
         can.transmit(now)
-        self._report_ready()
         changes = gateway.take_link_changes()
         if changes:
             for index in dict.fromkeys(changes):
@@ -264,13 +253,6 @@ class Loop:
 
     def _woken(self, _now: int, _events: int) -> None:
         self._wake.take()
-
-    def _own_deadline(self) -> int:
-        """Return the time of the next work apart from the gateway's."""
-        due = min(self.can.due, self._housekeeping.wake_due)
-        for esc in self._lost:
-            due = min(due, esc.due)
-        return due
 
     def _others(self, esc: EscPort) -> tuple[UsbIdentity | None, ...]:
         return tuple(other.identity for other in self.escs if other is not esc)

@@ -116,15 +116,15 @@ class NativePoller(Poller):
             if not self._follow_event():
                 self._leave()
                 break
-        _read_departures(turns.departures, can.gate, self.times.now)
+        can.gate.adopt(turns.departures, self.times.now)
         result = turns.result
         self.count += result.turns
         self.late = result.late
         if recorded is not None:
             recorded.turned(turns.entries(), result.taken)
         if unsent := turns.unsent():
-            can.transmitter.put_refused(unsent, turns.full_since)
-        if result.event >= 0 and turns.has_advanced:
+            can.transmitter.put_refused(unsent, turns.queue.full_since)
+        if result.event >= 0 and turns.reads.has_advanced:
             self._finish(can)
         ready = self.handlers(turns.ready()) if result.happened else []
         return Work(ready, not result.is_over)
@@ -146,7 +146,7 @@ class NativePoller(Poller):
         """Leave the rest of the iteration to the loop, after an event."""
         turns = self._turns
         self._core.dispatch_others(self.times.now)
-        if turns.has_unread:
+        if turns.reads.size:
             self._core.receive(*turns.read())
         turns.leave()
 
@@ -201,17 +201,3 @@ def _write_departures(gate: Gate, departures: Any) -> None:
     departures.older = under_way.frames
     departures.newer = 0
     departures.check_due = gate.look_due
-
-
-def _read_departures(departures: Any, gate: Gate, now: int) -> None:
-    """Tell the gate which frames are under way after iterations in C."""
-    gate.adopt(
-        departures.count,
-        departures.accepted,
-        departures.older,
-        departures.newer,
-        departures.checked,
-        departures.still_since,
-        departures.check_due,
-        now,
-    )

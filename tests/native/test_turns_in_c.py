@@ -353,14 +353,13 @@ def test_failed_interface_is_noticed_at_the_next_frame(
     it = InC(monkeypatch)
     it.feed(LiveData(consumed_charge=n) for n in range(300))
     it.run(1)
-    assert it.loop.can.gate.has_proof
     it.bus.answer = answer
+    it.bus.sent.clear()
     it.run(1.02)
-    assert not it.loop.can.gate.has_proof
     assert it.loop.gateway.status.can_state is CanState.DOWN
     it.bus.answer = Sent.OK
     it.run(2)
-    assert it.loop.can.gate.has_proof
+    assert len(it.bus.sent) > 50
     it.loop.close()
 
 
@@ -375,7 +374,6 @@ def test_sending_to_a_busy_driver_is_retried_every_two_milliseconds(
     it.run(1.2)
     assert 50 < len(it.bus.refused) <= 110
     # These are the first attempt with a new frame, and an attempt every 2 ms.
-    assert it.loop.can.gate.has_proof
     it.bus.answer = Sent.OK
     it.bus.sent.clear()
     it.run(1.3)

@@ -42,15 +42,15 @@ def test_queue_is_bounded_and_counts_its_losses() -> None:
     for n in range(QUEUE_LENGTH + 10):
         queue.put_all([queued(n)])
     assert len(queue) == QUEUE_LENGTH
-    assert queue.dropped == 10
+    assert queue.counters.dropped_frames == 10
     queue.put_all([slot(0x181)])
     assert len(queue) == QUEUE_LENGTH + 1, "slots are not held by a full queue"
     send(queue, sent, 2)
     queue.put_all([queued(7)])
     queue.clear()
     assert len(queue) == 0
-    assert queue.dropped == 10 + QUEUE_LENGTH - 1
-    assert queue.replaced == 1
+    assert queue.counters.dropped_frames == 10 + QUEUE_LENGTH - 1
+    assert queue.counters.replaced_frames == 1
     assert send(queue, sent, 9) == 0
 
 
@@ -141,9 +141,9 @@ def test_queued_frames_keep_their_order_and_each_slot_sends_its_newest(
     assert [f for f in sent if f.queued] == [f for f in put if f.queued]
     slots_put = sum(not f.queued for f in put)
     slots_sent = sum(not f.queued for f in sent)
-    assert slots_sent + queue.replaced == slots_put
+    assert slots_sent + queue.counters.replaced_frames == slots_put
     assert len(queue) == 0
-    assert queue.dropped == 0
+    assert queue.counters.dropped_frames == 0
 
 
 def test_pages_of_a_message_are_never_parts_of_a_transfer() -> None:
@@ -160,4 +160,4 @@ def test_pages_of_a_message_are_never_parts_of_a_transfer() -> None:
     queue.put_all([make((), GatewayStatus(), 0, 0, at) for at in numbers])
     send(queue, sent, 100)
     assert sorted(frame.data[0] for frame in sent) == list(numbers)
-    assert queue.replaced == 1
+    assert queue.counters.replaced_frames == 1

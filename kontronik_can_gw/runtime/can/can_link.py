@@ -26,7 +26,7 @@ from kontronik_can_gw.runtime.retry import Retry
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
 from kontronik_can_gw.runtime.system.locks import IdLocks
 from kontronik_can_gw.status import CanState
-from kontronik_can_gw.times import SECOND
+from kontronik_can_gw.times import NEVER, SECOND
 
 MAX_RETRY_NS = SECOND // 2
 SLOW_OPENING_NS = 10 * SECOND
@@ -84,12 +84,8 @@ class CanLink:
         Except in bus-off the loop asks the controller in any of its iterations, and need not wake
         up for that.
         """
-        due = self.gate.due
-        if self.controller.is_off:
-            due = min(due, self.controller.due)
-        if self._retry.due is not None:
-            due = min(due, self._retry.due)
-        return due
+        due = min(self.gate.due, self._retry.due)
+        return min(due, self.controller.due) if self.controller.is_off else due
 
     @property
     def is_open(self) -> bool:
@@ -113,7 +109,7 @@ class CanLink:
 
     def reopen(self, now: int) -> None:
         """Open a lost interface again if the next attempt is due."""
-        if self._retry.due is None or now < self._retry.due or self.port is not None:
+        if now < self._retry.due or self.port is not None:
             return
         try:
             self._open(now)
@@ -160,7 +156,7 @@ class CanLink:
 
     def _open(self, now: int) -> bool:
         """Open the interface. Returns False if the opener's thread opens it."""
-        self._retry.due = None
+        self._retry.due = NEVER
         port = self._opener.open()
         if port is None:
             self._opening_since = now
@@ -172,7 +168,7 @@ class CanLink:
     def _use(self, port: CanPort, now: int) -> None:
         """Use an open port."""
         self.port = port
-        self._retry.due = None
+        self._retry.due = NEVER
         self.gate.opened(port.frames_left(), now, port.is_socket)
         self.controller.is_off = False
         self._stuck = StuckCheck(self._noted)
@@ -232,7 +228,7 @@ class CanLink:
     def _follow(self, facts: LinkFacts, now: int) -> None:
         self.controller.note(facts, now)
         if self.port is None:
-            if facts.up and self._retry.due is not None:
+            if facts.up and self._retry.due != NEVER:
                 self._retry.due = now
         elif not facts.exists or not facts.up:
             self._lost(Sent.DOWN if facts.exists else Sent.GONE, now)
@@ -282,7 +278,7 @@ class CanLink:
 
     def look(self, now: int) -> None:
         """Follow the frames that have left. Call it before time passes for the gateway."""
-        if self.port is not None:
+        if self.port is not None and now >= self.gate.look_due:
             self.transmitter.look(self.port, now)
 
     def transmit(self, now: int) -> None:

@@ -37,11 +37,10 @@ class Transmitter:
         prove: Callable[[int], None],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.queue = TransmitQueue()
+        self.queue = TransmitQueue(gateway.status)
         self.gate = Gate(_shortest_timeout_ns(gateway), config.restart_after_ns)
         self.ask_restart: Callable[[str], None] = interface_restart.request
         self.reports = GateReports(config, self.gate, gateway.status, conditions)
-        self._channel = config.channel
         self._gateway = gateway
         self._status = gateway.status
         self._clock = clock
@@ -51,15 +50,15 @@ class Transmitter:
         """True if a replay has already taken the frames of this step."""
         self._has_failed = False
         """True if a port without a socket was busy for too long."""
-        self._works: dict[Act, Callable[[int], None]] = {
+        self._works: dict[Act, Callable[[int], object]] = {
             Act.HOLD: self._hold,
             Act.RELEASE: self._release,
             Act.PROVE: prove,
             Act.LIMIT: self._limit,
             Act.UNLIMIT: lambda now: gateway.limit(False, False, now),
-            Act.DROP: self._drop,
+            Act.DROP: lambda _now: self.queue.drop_measurements(),
             Act.FAIL: self._fail,
-            Act.ASK: self._ask,
+            Act.ASK: lambda _now: self.ask_restart(config.channel),
             Act.COUNT: self.reports.count_restart,
             Act.NOT_RESTARTED: self.reports.report_missing_unit,
             Act.WORKED: self.reports.report_restarts,
@@ -71,22 +70,10 @@ class Transmitter:
         """Return the age at which a frame is too old to be sent, from the iteration's start."""
         return min(MAX_LATE_NS, self.gate.timeout_ns)
 
-    def max_wait_ns(self) -> int:
-        """Return the longest wait of the loop: a quarter of the shortest timeout of the ESCs.
-
-        It is a millisecond less, because a wait is rounded up to a millisecond.
-        """
-        return _shortest_timeout_ns(self._gateway) // 4 - MS
-
     @property
     def is_idle(self) -> bool:
         """True if no frame waits, is held or is limited, and the port refused none."""
         return not len(self.queue) and self.gate.may_run_in_c
-
-    def put(self, frames: Sequence[CanFrame]) -> None:
-        """Append frames to the transmit queue."""
-        if self.queue.put_all(frames):
-            self._count_losses()
 
     def put_refused(self, frames: Sequence[CanFrame], since: int) -> None:
         """Append frames that an iteration in C could not send.
@@ -94,16 +81,15 @@ class Transmitter:
         ``since`` is the time since which the port has accepted no frame.
         """
         self.gate.refused_since = since
-        self.put(frames)
+        self.queue.put_all(frames)
 
-    def look(self, port: CanPort | None, now: int) -> None:
+    def look(self, port: CanPort, now: int) -> None:
         """Follow the interface's count. Call it before time passes for the gateway.
 
         A replay then takes the frames of this step as they are taken here.
         """
-        gate = self.gate
-        if port is not None and gate.must_look(now):
-            self._look(port, now)
+        self.gate.look(port.frames_left(), port.frames_queued(), now)
+        self.work(now)
 
     def transmit(self, port: CanPort | None, now: int) -> Sent | None:
         """Take the gateway's due frames, and hand them to the port until it refuses one.
@@ -114,15 +100,11 @@ class Transmitter:
         3. None is also returned if frames became too late meanwhile. The next iteration drops them.
         4. While frames are held, only the first frame is handed over.
         """
-        self._is_after_advance = True
-        answer = self._transmit(port, now)
-        self._is_after_advance = False
-        return answer
-
-    def _transmit(self, port: CanPort | None, now: int) -> Sent | None:
         gate = self.gate
         gateway = self._gateway
         gate.timeout_ns = _shortest_timeout_ns(gateway)
+        is_limited = gateway.is_limited
+        self._is_after_advance = True
         if gate.is_quiet != gateway.status.is_quiet:
             self._follow_quiet(now)
         gate.advance(now)
@@ -130,19 +112,21 @@ class Transmitter:
             gate.request(now)
         if gate.acts:
             self.work(now)
+        answer = None
         if port is None or gate.is_off:
-            return None
-        if gateway.is_held:
+            pass
+        elif gateway.is_held:
             # Frames that are released now are sent in the next iteration, at once, as in a replay.
-            return self._send_first_frame(port, now)
-        if gate.is_limited:
-            return self._send_limited(port, now)
-        frames = gateway.take_frames(now)
-        if frames:
-            self.put(frames)
-        if not gate.may_try(now):
-            return None
-        return self._send(port, None, now)
+            answer = self._send_first_frame(port, now)
+        elif is_limited:
+            # Also in the iteration that ends the limit. A replay takes no frames in it.
+            answer = self._send_limited(port, now)
+        else:
+            self.queue.put_all(gateway.take_frames(now))
+            if gate.may_try(now):
+                answer = self._send(port, None, now)
+        self._is_after_advance = False
+        return answer
 
     def advance(self, now: int) -> None:
         """Let time pass for the gate, without handing over frames."""
@@ -159,10 +143,6 @@ class Transmitter:
         self.reports.end_faults(now)
 
     # --- handing over
-
-    def _look(self, port: CanPort, now: int) -> None:
-        self.gate.look(port.frames_left(), port.frames_queued(), now)
-        self.work(now)
 
     def _send(self, port: CanPort, most: int | None, now: int) -> Sent | None:
         """Hand frames to the port until it refuses one, at most ``most``."""
@@ -190,14 +170,14 @@ class Transmitter:
         Answers and measurements alternate while both wait.
         """
         gateway = self._gateway
-        self.put(gateway.take_some(0, now))
+        self.queue.put_all(gateway.take_some(0, now))
         room = self.gate.room(now)
         if not room or not self.gate.may_try(now):
             return None
-        self.put(gateway.take_some(self.queue.share_of_measurements(room), now))
+        self.queue.put_all(gateway.take_some(self.queue.share_of_measurements(room), now))
         answer = self._send(port, room, now)
         was_refused = answer is not None and answer is not Sent.OK
-        if was_refused and gateway.is_limited and self.drop_measurements():
+        if was_refused and gateway.is_limited and self.queue.drop_measurements():
             gateway.limit(True, True, now)  # they would get old
         return answer
 
@@ -219,7 +199,7 @@ class Transmitter:
         self._status.sent_frames += 1
         gate.accepted_first(now)
         self.work(now)
-        self._look(port, now)
+        self.look(port, now)
         return answer
 
     def _note_refusal(self, answer: Sent, now: int) -> Sent:
@@ -240,15 +220,6 @@ class Transmitter:
         self.work(now)
         return self._status.replaced_frames != replaced
 
-    def drop_measurements(self) -> bool:
-        """Discard the waiting measurements. Returns True if there were any.
-
-        Answers stay in the queue in their order.
-        """
-        dropped = self.queue.drop_measurements()
-        self._count_losses()
-        return dropped
-
     # --- the gate's work
 
     def _hold(self, now: int) -> None:
@@ -260,10 +231,9 @@ class Transmitter:
             frames = gateway.take_frames(now)
             if frames:
                 gateway.not_sent(now)
-                self.put(frames)  # counts them as lost
-        self.put(gateway.output_frames)
+                self.queue.put_all(frames)  # counts them as lost
+        self.queue.put_all(gateway.output_frames)
         self.queue.clear()
-        self._count_losses()
         gateway.hold(now)
         self._is_told = True
 
@@ -272,16 +242,10 @@ class Transmitter:
         self._gateway.release(now)
 
     def _limit(self, now: int) -> None:
-        self._gateway.limit(True, self.drop_measurements(), now)
-
-    def _drop(self, _now: int) -> None:
-        self.drop_measurements()
+        self._gateway.limit(True, self.queue.drop_measurements(), now)
 
     def _fail(self, _now: int) -> None:
         self._has_failed = True
-
-    def _ask(self, _now: int) -> None:
-        self.ask_restart(self._channel)
 
     def _follow_quiet(self, now: int) -> None:
         """Follow the begin or the end of the gateway's quiet mode."""
@@ -289,14 +253,6 @@ class Transmitter:
         self.gate.quiet(is_quiet, now)
         self.work(now)
         self.reports.report_quiet(is_quiet, now)
-
-    def _count_losses(self) -> None:
-        status = self._status
-        queue = self.queue
-        status.replaced_frames += queue.replaced
-        status.dropped_frames += queue.dropped
-        queue.replaced = 0
-        queue.dropped = 0
 
 
 def _shortest_timeout_ns(gateway: Gateway) -> int:

@@ -59,8 +59,6 @@ class EscPort:
         self.identity: UsbIdentity | None = None
         self.reopened = -1
         """Number of times that the port was opened again. -1 before it was opened at all."""
-        self.due = 0
-        """Time of the next attempt to open the port. It has no meaning while the port is open."""
         self.line_errors: dict[str, int] = {}
         """Line errors since the start of the gateway, by kind."""
         self._index = index
@@ -71,7 +69,7 @@ class EscPort:
         self._conditions = conditions
         self._clock = clock
         self._noted = poller.noted(index)
-        self._retry = Retry(MAX_RETRY_NS)
+        self.retry = Retry(MAX_RETRY_NS)
         self.log = EscLog(index, gateway, conditions)
         self._counted: Mapping[str, int] = {}
         self._stuck = StuckCheck(self._noted)
@@ -165,7 +163,7 @@ class EscPort:
                 # Until bytes arrive, the pauses between attempts grow. So a port that is lost
                 # each time as soon as it is open is tried less and less often.
                 noted.is_plain = True
-                self._retry.succeeded()
+                self.retry.succeeded()
             since = noted.undrained_ns
             if since == NEVER:
                 since = max(noted.empty_ns, self._poller.times.before)
@@ -179,7 +177,7 @@ class EscPort:
 
     def reopen(self, now: int, others: tuple[UsbIdentity | None, ...] = ()) -> None:
         """Open a lost port again if the next attempt is due."""
-        if self in self._lost and now >= self.due:
+        if self in self._lost and now >= self.retry.due:
             self.open(now, True, others)
 
     def close(self) -> None:
@@ -227,7 +225,7 @@ class EscPort:
         self._counted = counts
 
     def _failed(self, reason: str, now: int, quiet: bool = False) -> None:
-        self.due = self._retry.failed(now)
+        self.retry.failed(now)
         self._lost.add(self)
         self._lost_since = self._lost_since or now
         self._gateway.port(self._index, False, now)
