@@ -9,9 +9,9 @@ from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY
 from kontronik_can_gw.times import END_OF_TIME, SECOND
 
 
-def check_time(time_ns: int) -> None:
+def check_time(time_ns: int | None) -> None:
     """Raise ValueError for a time that no gateway has."""
-    if not 0 <= time_ns < END_OF_TIME:
+    if time_ns is not None and not 0 <= time_ns < END_OF_TIME:
         raise ValueError(f"time {time_ns}")
 
 

@@ -113,8 +113,7 @@ class Replay:
 
     def _play(self, entry: Entry) -> list[TimedFrame]:
         check_time(entry.time_ns)
-        if entry.came_ns is not None:
-            check_time(entry.came_ns)
+        check_time(entry.came_ns)
         call = CALL_OF.get(EntryKind(entry.kind))
         if call is None:
             self._follow_note(entry)

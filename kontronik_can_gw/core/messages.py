@@ -44,16 +44,12 @@ class Traits:
         # Without a cycle, a minimum delay time and further groups, time never makes it pending.
         self.is_untimed = not any((plan.cycle_ns, plan.delay_ns, self.is_paged))
         self.is_silent_on_loss = settings.silent_on_loss and plan.can_stop
-        counters = [signal for signal in plan.compiled if signal.role is Role.ALIVE]
-        self.alive_modulus = 0
-        for counter in counters:
-            self.alive_modulus = alive_modulus(counter, plan.e2e)
+        moduli = [alive_modulus(s, plan.e2e) for s in plan.compiled if s.role is Role.ALIVE]
+        self.alive_modulus = max(moduli, default=0)
+        paces = plan.paces if self.by_event or self.on_change else ()
+        self.follows_gateway = Group.GATEWAY in paces
         self.triggers = Event.NONE
-        self.follows_gateway = False
-        if not (self.by_event or self.on_change):
-            return
-        self.follows_gateway = Group.GATEWAY in plan.paces
-        for pace in plan.paces:
+        for pace in paces:
             self.triggers |= _EVENT_OF_PACE[pace]
         by_live_frames = self.by_event and self.triggers & Event.LIVE
         if self.triggers & Event.LINK and not (plan.cycle_ns or by_live_frames):
@@ -94,6 +90,10 @@ class _Message(Traits):
         super().__init__(plan, settings)
         self.index = index
         self.plan = plan
+        self.live_triggers = self.triggers
+        """Its triggers while live data is fresh."""
+        if self.by_event and self.triggers & Event.LIVE:
+            self.live_triggers &= ~Event.LINK  # each live frame causes it already
         self.frame = compile_frame(plan)
         self.place = 0
         self.pages_to_send: set[int] = set()
@@ -214,7 +214,8 @@ class Messages:
                 self._timed.append(message)
         self.pending: dict[int, int] = {}
         """Indices of the messages that ``take`` sends, and the times at which they became due."""
-        self._is_stopping = False
+        self._is_last = False
+        """True while nothing follows the pending messages, so all their groups are sent."""
         self._is_quiet = False
 
     @property
@@ -245,10 +246,7 @@ class Messages:
         # Live or info data have ended. No later event sends the remaining groups.
         has_ended = not is_live or (events & Event.INFO and state.info is None)
         for message in self._of_esc[esc]:
-            causes = message.triggers
-            if is_live and message.by_event and causes & Event.LIVE:
-                causes &= ~Event.LINK  # each live frame causes it already
-            if causes & events:
+            if events & (message.live_triggers if is_live else message.triggers):
                 if has_ended and message.by_event:
                     message.add_all_pages()
                 self._request(message, now)
@@ -280,7 +278,6 @@ class Messages:
     def stop(self, now: int) -> None:
         """Send the messages with the gateway's own state at once, all groups, at any distance."""
         if not self._is_quiet:
-            self._is_stopping = True
             self._send_last(now)
 
     def begin_quiet(self, now: int) -> None:
@@ -296,11 +293,13 @@ class Messages:
     def end_quiet(self, now: int) -> None:
         """Send everything again."""
         self._is_quiet = False
+        self._is_last = False
         self.on_gateway_change(now)
         self.repeat(now)
 
     def _send_last(self, now: int) -> None:
         """Send the messages with the gateway's own state at once, all groups, at any distance."""
+        self._is_last = True
         for message in self._of_gateway:
             if message.by_event:
                 message.add_all_pages()
@@ -339,11 +338,10 @@ class Messages:
             message = self._messages[index]
             why = message.why
             message.why = 0
-            if message.is_silent_on_loss:
-                has_telemetry = any(self._escs[esc].up for esc in message.plan.escs)
-                if not has_telemetry:
-                    message.pages_to_send.clear()
-                    continue
+            escs = message.plan.escs
+            if message.is_silent_on_loss and not any(self._escs[esc].up for esc in escs):
+                message.pages_to_send.clear()
+                continue
             # A request sends the groups that have changed, the end of a cycle the next one.
             is_sent = bool(why & _REQUEST) and self._note_news(message, now)
             if why & _CYCLE:
@@ -351,8 +349,8 @@ class Messages:
                 is_sent = True
             if is_sent:
                 frames.append(self._frame(message, now))
-            while is_sent and (self._is_stopping or self._is_quiet) and message.pages_to_send:
-                frames.append(self._frame(message, now))
+                while self._is_last and message.pages_to_send:
+                    frames.append(self._frame(message, now))
         return frames
 
     @property

@@ -14,7 +14,7 @@ The states and events are the table ``TABLE`` of gate_table.py. docs/design.md s
 from typing import Any
 
 from kontronik_can_gw.gateway.gate_rules import CHANGES, TESTS
-from kontronik_can_gw.gateway.gate_state import GateState, Limit
+from kontronik_can_gw.gateway.gate_state import FirstFrame, GateState, Limit
 from kontronik_can_gw.gateway.gate_table import (
     ANSWER_NS,
     HELD,
@@ -23,6 +23,7 @@ from kontronik_can_gw.gateway.gate_table import (
     NOT_SLOW,
     SOON_NS,
     TABLE,
+    WAITING,
     Event,
     Row,
     State,
@@ -32,6 +33,8 @@ from kontronik_can_gw.times import MS, NEVER
 POLL_NS = 2 * MS
 """Time between two looks while frames are limited, and between two attempts on a busy port."""
 _NO_ROWS: tuple[Row, ...] = ()
+_CLOSELY = (State.SLOW, State.MOVING, State.FIRST)
+"""States in which the interface's count is looked at every POLL_NS."""
 
 
 def _rows() -> dict[tuple[State, Event], tuple[Row, ...]]:
@@ -103,7 +106,7 @@ class Gate(GateState):
 
     def accepted(self, frames: int, now: int) -> None:
         """Note frames that the interface has accepted."""
-        self.refused_since = None
+        self.refused_since = NEVER
         self.retry_due = NEVER
         under_way = self.under_way
         if not under_way.frames:
@@ -115,8 +118,7 @@ class Gate(GateState):
 
     def refused(self, is_full: bool, now: int) -> None:
         """Note that the interface is busy. ``is_full``: it reports when there is room."""
-        if self.refused_since is None:
-            self.refused_since = now
+        self.refused_since = min(self.refused_since, now)
         if self.state is State.BLOCKED:
             self.retry_due = now + self.quarter_ns
         elif is_full:
@@ -135,11 +137,9 @@ class Gate(GateState):
         if not under_way.frames:
             self.still_since = now
         under_way.add(1, now)
-        self.refused_since = None
-        self.first.is_missing = False
-        self.first.at = now
-        self.first.count = under_way.count + under_way.frames
-        self.first.moves_since = None
+        self.refused_since = NEVER
+        count = under_way.count + under_way.frames
+        self.first = FirstFrame(at=now, count=count)
         self._step(Event.FIRST_ACCEPTED, now)
 
     def no_first_frame(self, now: int) -> None:
@@ -160,13 +160,10 @@ class Gate(GateState):
                 self.retry_due = NEVER
             elif was_late and self.state is State.SLOW:
                 self.limit.takes_long = True
-            if self.first.at is not None and self.first.moves_since is None:
-                self.first.moves_since = now
+            if self.first.at != NEVER:
+                self.first.moves_since = min(self.first.moves_since, now)
             if self.state in HELD:
                 self.outage_since = now
-        self.look_due = self._next_look(now)
-        if not has_moved and not under_way.frames and self.state is not State.MOVING:
-            return
         self._step(Event.MOVED if has_moved else Event.STILL, now)
         self.look_due = self._next_look(now)
 
@@ -235,9 +232,7 @@ class Gate(GateState):
         if self.is_quiet:
             self.is_stalled = False  # nobody listens on the bus of a parked vehicle
         if state is State.BLOCKED:
-            self.first.at = None
-            self.first.moves_since = None
-            self.first.is_missing = False
+            self.first = FirstFrame()
         elif state is State.SETTLING:
             self.runs_since = now
         if state is State.BLOCKED or state is State.QUIET_BLOCKED:
@@ -248,27 +243,22 @@ class Gate(GateState):
         """Return the time of the next look."""
         state = self.state
         has_frames = bool(self.under_way.frames)
-        if state in NO_PORT:
+        if state in NO_PORT or self.is_off:
             return NEVER
-        if state is State.SLOW or state is State.MOVING:
-            return now + POLL_NS
-        if state is State.FIRST:
-            assert self.first.at is not None
-            is_soon = now - self.first.at < SOON_NS
-            return now + (POLL_NS if is_soon else self.quarter_ns)
-        if state is State.RESTARTING and self.is_off:
-            return NEVER
-        if state in HELD and self.is_quiet:
-            return now + LASTING_NS if has_frames else NEVER
-        if state is State.RESTARTING or state is State.BLOCKED:
+        if state is State.FIRST and now - self.first.at >= SOON_NS:
             return now + self.quarter_ns
-        return now + self.period_ns if has_frames else NEVER
+        if state in _CLOSELY:
+            return now + POLL_NS
+        if state in WAITING and not self.is_quiet:
+            return now + self.quarter_ns
+        pause = LASTING_NS if state in HELD else self.period_ns
+        return now + pause if has_frames else NEVER
 
     def _forget(self) -> None:
         """Forget accepted and refused frames, because the interface or the bus was lost."""
         self.under_way.forget()
-        self.refused_since = None
+        self.refused_since = NEVER
         self.retry_due = NEVER
         self.still_since = NEVER
-        self.first.at = None
-        self.first.moves_since = None
+        self.first.at = NEVER
+        self.first.moves_since = NEVER

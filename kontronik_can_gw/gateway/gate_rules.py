@@ -24,9 +24,7 @@ from kontronik_can_gw.times import NEVER
 
 def _hold(gate: GateState, now: int) -> None:
     if not gate.is_held and gate.state in (State.BLOCKED, State.QUIET_BLOCKED):
-        gate.outage_since = now if gate.still_since == NEVER else gate.still_since
-        if gate.refused_since is not None:
-            gate.outage_since = min(gate.outage_since, gate.refused_since)
+        gate.outage_since = min(now, gate.still_since, gate.refused_since)
     gate.is_held = True
     gate.discarded = now
 
@@ -40,8 +38,8 @@ def _release(gate: GateState, now: int) -> None:
     gate.is_held = False
     gate.restart.works_since = now
     gate.restart.works_count = gate.under_way.count + gate.restart.frames + 1
-    gate.first.at = None
-    gate.first.moves_since = None
+    gate.first.at = NEVER
+    gate.first.moves_since = NEVER
     gate.retry_due = NEVER
     if not gate.restart.count:
         gate.is_stalled = False
@@ -121,7 +119,7 @@ def _is_quarter_over(gate: GateState, now: int) -> bool:
 
 
 def _is_refused_long(gate: GateState, now: int) -> bool:
-    return gate.refused_since is not None and now - gate.refused_since >= LASTING_NS
+    return now - gate.refused_since >= LASTING_NS
 
 
 def _is_stall_noticed(gate: GateState, now: int) -> bool:
@@ -137,24 +135,18 @@ def _has_first_left(gate: GateState, now: int) -> bool:
     count stays too low. Then the first frame has left SOON_NS after another one, unless it
     still waits in the kernel's queue.
     """
-    if gate.first.at is None or gate.queued:
+    if gate.first.at == NEVER or gate.queued:
         return False
-    if gate.under_way.count >= gate.first.count:
-        return True
-    return gate.first.moves_since is not None and now - gate.first.moves_since >= SOON_NS
+    return gate.under_way.count >= gate.first.count or now - gate.first.moves_since >= SOON_NS
 
 
 def _has_first_left_slowly(gate: GateState, now: int) -> bool:
-    if not _has_first_left(gate, now):
-        return False
-    assert gate.first.moves_since is not None
-    return gate.limit.takes_long or now - gate.first.moves_since > gate.quarter_ns
+    is_slow = gate.limit.takes_long or now - gate.first.moves_since > gate.quarter_ns
+    return is_slow and _has_first_left(gate, now)
 
 
 def _is_first_lost(gate: GateState, now: int) -> bool:
-    if gate.first.at is None or gate.queued:
-        return False
-    return now - gate.first.at >= LASTING_NS
+    return not gate.queued and now - gate.first.at >= LASTING_NS
 
 
 def _may_ask_now(gate: GateState, now: int) -> bool:
@@ -200,7 +192,7 @@ TESTS: Mapping[If, Callable[[GateState, int], bool]] = {
     If.FIRST_LEFT: _has_first_left,
     If.FIRST_LEFT_SLOWLY: _has_first_left_slowly,
     If.BUS_IS_ON: lambda gate, _now: not gate.is_off,
-    If.FIRST_SENT: lambda gate, _now: gate.first.at is not None,
+    If.FIRST_SENT: lambda gate, _now: gate.first.at != NEVER,
     If.STANDS: lambda gate, now: now - gate.outage_since >= LASTING_NS,
     If.REPEAT: _is_first_lost,
     If.STALLED: _is_stall_noticed,

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 from kontronik_can_gw.gateway.gate_table import (
     ANSWER_NS,
-    HELD,
     LASTING_NS,
     NO_PORT,
     PASSING,
     UNLIMITED,
+    WAITING,
     Act,
     State,
 )
@@ -35,11 +35,11 @@ class Limit:
 class FirstFrame:
     """The first frame after an outage."""
 
-    at: int | None = None
-    """Time at which it was accepted. None before."""
+    at: int = NEVER
+    """Time at which it was accepted."""
     count: int = 0
     """The interface's count as soon as it has left."""
-    moves_since: int | None = None
+    moves_since: int = NEVER
     """Time since which frames leave after it was accepted."""
     is_missing: bool = False
     """True if each possible frame has measurements."""
@@ -96,8 +96,8 @@ class GateState:
         """Time since which no frame has left the interface, while frames are held."""
         self.discarded = -NEVER
         """Time at which waiting frames were discarded."""
-        self.refused_since: int | None = None
-        """Time since which the port has accepted no frame. None if it accepted the last one."""
+        self.refused_since = NEVER
+        """Time since which the port has accepted no frame. NEVER if it accepted the last one."""
         self.runs_since = 0
         """Time since which a controller runs although its driver reports bus-off."""
         self.retry_due = NEVER
@@ -144,7 +144,7 @@ class GateState:
     def may_run_in_c(self) -> bool:
         """True if no frame is held, limited or refused."""
         is_free = self.state is State.OPEN or self.state is State.QUIET
-        return is_free and self.refused_since is None
+        return is_free and self.refused_since == NEVER
 
     def room(self, now: int) -> int:
         """Return how many frames may be handed over now."""
@@ -178,7 +178,7 @@ class GateState:
         if state is State.SLOW:
             return min(self.look_due, self.limit.quarter_due)
         due = min(self.retry_due, self.look_due)
-        if state in HELD and state not in NO_PORT and state is not State.QUIET_BLOCKED:
+        if state in WAITING:
             due = min(due, self.discarded + LASTING_NS)
         if state is State.RESTARTING:
             due = min(due, self.restart.asked + ANSWER_NS)

@@ -151,11 +151,12 @@ PASSING = (_S.UNPROVEN, _S.OPEN, _S.SLOW, _S.QUIET)
 """States in which frames pass."""
 NOT_SLOW = (_S.OPEN, _S.LOST, _S.QUIET, _S.QUIET_BLOCKED)
 """States in which a limit and a report of a slow bus end."""
-_WAITING = (_S.BLOCKED, _S.FIRST, _S.MOVING, _S.RESTARTING)
+WAITING = (_S.BLOCKED, _S.FIRST, _S.MOVING, _S.RESTARTING)
+"""States in which frames are held although there is a port, except in quiet mode."""
 _SHUT = (_S.CLOSED, _S.OPENING, _S.LOST)
-HELD = (*NO_PORT, *_WAITING, _S.QUIET_BLOCKED)
+HELD = (*NO_PORT, *WAITING, _S.QUIET_BLOCKED)
 """States in which frames are held."""
-_UP = (*PASSING, *_WAITING, _S.QUIET_BLOCKED)
+_UP = (*PASSING, *WAITING, _S.QUIET_BLOCKED)
 _OFF = (_S.BUS_OFF, _S.SETTLING, _S.RESTARTING)
 
 TABLE = (
@@ -206,8 +207,8 @@ TABLE = (
     Row((_S.MOVING,), _E.STILL, If.FIRST_LEFT, _S.OPEN, (Act.RELEASE, Act.PROVE)),
     Row((_S.MOVING,), _E.STILL, If.STANDS, _S.BLOCKED),
     Row((_S.FIRST,), _E.TIME, If.REPEAT, _S.BLOCKED),
-    Row(_WAITING, _E.TIME, If.STALLED, None, (Act.STALLED,)),
-    Row(_WAITING, _E.TIME, If.DISCARD, None, (Act.HOLD,)),
+    Row(WAITING, _E.TIME, If.STALLED, None, (Act.STALLED,)),
+    Row(WAITING, _E.TIME, If.DISCARD, None, (Act.HOLD,)),
     # bus-off
     Row(_UP, _E.BUS_OFF, If.ALWAYS, _S.BUS_OFF, (Act.HOLD,)),
     Row((_S.BUS_OFF, _S.RESTARTING), _E.RUNS, If.ALWAYS, _S.SETTLING),
@@ -231,7 +232,7 @@ TABLE = (
     # quiet mode
     Row((_S.UNPROVEN, _S.OPEN), _E.QUIET_BEGINS, If.ALWAYS, _S.QUIET, (Act.DROP,)),
     Row((_S.SLOW,), _E.QUIET_BEGINS, If.ALWAYS, _S.QUIET, (Act.DROP, Act.UNLIMIT)),
-    Row(_WAITING[:3], _E.QUIET_BEGINS, If.ALWAYS, _S.QUIET_BLOCKED, (Act.HOLD,)),
+    Row(WAITING[:3], _E.QUIET_BEGINS, If.ALWAYS, _S.QUIET_BLOCKED, (Act.HOLD,)),
     Row((_S.QUIET,), _E.STILL, If.BLOCKED, _S.QUIET_BLOCKED, (Act.HOLD,)),
     Row((_S.QUIET_BLOCKED,), _E.MOVED, If.ALWAYS, _S.QUIET, (Act.RELEASE, Act.PROVE)),
     Row((_S.QUIET_BLOCKED,), _E.REQUEST, If.ALWAYS, _S.QUIET, (Act.RELEASE, Act.PROVE)),
@@ -240,5 +241,5 @@ TABLE = (
     Row((_S.QUIET, _S.QUIET_BLOCKED), _E.QUIET_ENDS, If.ALWAYS, _S.BLOCKED, (Act.HOLD,)),
     # the process
     Row(PASSING, _E.SUSPENDED, If.ALWAYS, None, (Act.DROP,)),
-    Row(_WAITING, _E.STOP, If.ALWAYS, None, (Act.HOLD,)),
+    Row(WAITING, _E.STOP, If.ALWAYS, None, (Act.HOLD,)),
 )

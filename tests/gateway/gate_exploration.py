@@ -86,7 +86,7 @@ def limits(gate: Gate) -> dict[str, int]:
     if restart.is_awaited:
         found["answer"] = restart.asked + ANSWER_NS
     if state in PASSING:
-        if gate.refused_since is not None:
+        if gate.refused_since != NEVER:
             found["refused"] = gate.refused_since + LASTING_NS
         if state is not State.QUIET:
             found["late"] = gate.under_way.oldest + TIMEOUT // 4 + 1
@@ -100,14 +100,14 @@ def limits(gate: Gate) -> dict[str, int]:
             found["blocked"] = gate.still_since + LASTING_NS
     if state is State.BLOCKED:
         found["retry"] = gate.retry_due
-        if not gate.is_socket and gate.refused_since is not None:
+        if not gate.is_socket and gate.refused_since != NEVER:
             found["refused"] = gate.refused_since + LASTING_NS
         if gate.under_way.frames:
             found["no first"] = gate.outage_since + NO_FIRST_NS
     if state in (State.FIRST, State.MOVING, State.RESTARTING):
-        if first.at is not None:
+        if first.at != NEVER:
             found["repeat"] = first.at + LASTING_NS
-        if first.moves_since is not None:
+        if first.moves_since != NEVER:
             found["moved"] = first.moves_since + SOON_NS
             found["slowly"] = first.moves_since + TIMEOUT // 4 + 1
     if state in HELD and state not in NO_PORT:
@@ -146,9 +146,9 @@ def key_of(gate: Gate, now: int) -> Key:
         key.append(limit.frames if limit.frames in (1, 2, UNLIMITED - 1, UNLIMITED) else 3)
         key.append(limit.late - limit.since >= LASTING_NS)
     if state in (State.FIRST, State.MOVING, State.RESTARTING, State.BLOCKED):
-        key += [bool(gate.queued), gate.first.is_missing, gate.first.at is None]
-        key.append(gate.first.moves_since is None)
-        key.append(gate.first.at is not None and gate.first.count <= gate.under_way.count)
+        key += [bool(gate.queued), gate.first.is_missing, gate.first.at == NEVER]
+        key.append(gate.first.moves_since == NEVER)
+        key.append(gate.first.at != NEVER and gate.first.count <= gate.under_way.count)
     if state in PASSING and restart.asked != -NEVER and has_count:
         key.append(gate.under_way.count >= restart.works_count)
     return tuple(key)

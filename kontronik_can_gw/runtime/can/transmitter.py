@@ -16,7 +16,7 @@ from kontronik_can_gw.runtime.can import interface_restart
 from kontronik_can_gw.runtime.can.can_port import CanPort
 from kontronik_can_gw.runtime.can.gate_reports import GateReports
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
-from kontronik_can_gw.times import MS
+from kontronik_can_gw.times import MS, NEVER
 
 MAX_LATE_NS = 250 * MS
 """Longest delay of a measurement. The shortest telemetry timeout may be a lower limit."""
@@ -149,7 +149,7 @@ class Transmitter:
         gate = self.gate
         frames = self.queue.in_order()
         if not frames:
-            gate.refused_since = None
+            gate.refused_since = NEVER
             return None
         count, answer = port.send_all(frames[:most], self._clock, now + self.max_turn_ns())
         self.queue.remove(frames, count)
