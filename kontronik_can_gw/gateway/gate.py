@@ -159,7 +159,7 @@ class Gate(GateState):
             if self.state is State.BLOCKED:
                 self.retry_due = NEVER
             elif was_late and self.state is State.SLOW:
-                self.limit.takes_long = True
+                self.limit.is_long = True
             if self.first.at != NEVER:
                 self.first.moves_since = min(self.first.moves_since, now)
             if self.state in HELD:

@@ -103,7 +103,7 @@ def _is_blocked(gate: GateState, now: int) -> bool:
     if gate.under_way.count == UNCOUNTED:
         return False
     limit = gate.timeout_ns * 7 // 8
-    if gate.state is State.SLOW and gate.limit.takes_long:
+    if gate.state is State.SLOW and gate.limit.is_long:
         limit = max(limit, LASTING_NS)
     return now - gate.still_since >= limit
 
@@ -141,7 +141,7 @@ def _has_first_left(gate: GateState, now: int) -> bool:
 
 
 def _has_first_left_slowly(gate: GateState, now: int) -> bool:
-    is_slow = gate.limit.takes_long or now - gate.first.moves_since > gate.quarter_ns
+    is_slow = gate.limit.is_long or now - gate.first.moves_since > gate.quarter_ns
     return is_slow and _has_first_left(gate, now)
 
 

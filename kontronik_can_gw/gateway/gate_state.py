@@ -27,7 +27,7 @@ class Limit:
     """Time at which the bus became slow."""
     late: int = 0
     """The last time at which a frame was under way for more than a quarter."""
-    takes_long: bool = False
+    is_long: bool = False
     """True if a frame has left late since the bus became slow, so it is not just blocked."""
 
 

@@ -73,7 +73,7 @@ static int fetch(kcg_turns *t, int fd, kcg_input *in)
     ssize_t size = has_room(t, KCG_READ) ? read(fd, r->data, KCG_READ) : 0;
     if (size <= 0)
         return 0;
-    in->served = 1;
+    in->is_served = 1;
     r->size = (uint32_t)size;
     r->since = in->undrained_ns != KCG_DRAINED ? in->undrained_ns : in->asked_ns;
     /* Bytes that this read left arrived after those that it returned. Whether it left any is polled
@@ -355,7 +355,7 @@ static void restore_settings(kcg_turns *t)
         kcg_input *in = input_at(t, i);
         int fd = t->ports.fds[i].fd;
         if (in && !ioctl(fd, TCGETS, found) && memcmp(found, in->settings, sizeof found))
-            in->restored |= !ioctl(fd, TCSETS, in->settings);
+            in->is_restored |= !ioctl(fd, TCSETS, in->settings);
     }
 }
 

@@ -27,8 +27,8 @@ typedef struct {
        undrained_ns: bytes that are in the port now arrived after this time. KCG_DRAINED: the port
        was empty at the last poll, so bytes arrived after asked_ns. */
     int64_t empty_ns, asked_ns, undrained_ns;
-    uint8_t is_plain, served, esc;
-    uint8_t restored;     /* Another program had changed the settings, and they were set again. */
+    uint8_t is_plain, is_served, esc;
+    uint8_t is_restored;  /* Another program had changed the settings, and they were set again. */
     uint8_t reserved[4];
     uint8_t settings[KCG_SETTINGS]; /* struct termios as the port was set, then zeros. */
 } kcg_input;

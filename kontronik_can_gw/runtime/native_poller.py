@@ -92,7 +92,7 @@ class NativePoller(Poller):
         port = can.port
         if self._core.reports_live or gateway.frames_wait or gateway.is_held:
             return False
-        if port is None or port.gone or not port.is_socket:
+        if port is None or port.is_gone or not port.is_socket:
             return False
         if port.state is not gateway.status.can_state or can.controller.is_off:
             return False

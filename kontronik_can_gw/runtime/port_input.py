@@ -18,11 +18,11 @@ class PortInput:
         """If the last read left bytes in the port, a time before these arrived. Otherwise NEVER."""
         self.is_plain = False
         """True if a readable port only has to be read."""
-        self.served = True
+        self.is_served = True
         """True if the port was read since this was set to False."""
         self.settings = bytearray()
         """The settings of the port."""
-        self.restored = False
+        self.is_restored = False
         """True if C has restored the settings since this was set to False."""
 
 
@@ -39,13 +39,13 @@ class StuckCheck:
 
     def __init__(self, noted: PortInput) -> None:
         self._noted = noted
-        noted.served = True
+        noted.is_served = True
         self._has_waited = False
 
     def is_stuck(self, port: WaitingPort | None) -> bool:
         """Return True if bytes waited at this call and the last one, and none was read."""
-        waits = port is not None and not self._noted.served and port.waits_to_be_read
+        waits = port is not None and not self._noted.is_served and port.waits_to_be_read
         is_stuck = waits and self._has_waited
-        self._noted.served = False
+        self._noted.is_served = False
         self._has_waited = waits
         return is_stuck

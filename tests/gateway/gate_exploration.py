@@ -96,7 +96,7 @@ def limits(gate: Gate) -> dict[str, int]:
             found["worked"] = restart.works_since + WORKED_NS
     if state is State.SLOW:
         found["quarter"] = gate.limit.quarter_due
-        if gate.limit.takes_long:
+        if gate.limit.is_long:
             found["blocked"] = gate.still_since + LASTING_NS
     if state is State.BLOCKED:
         found["retry"] = gate.retry_due
@@ -138,7 +138,7 @@ def key_of(gate: Gate, now: int) -> Key:
         return tuple(key)
     has_count = gate.under_way.count != UNCOUNTED
     key += [gate.is_socket, gate.is_off, gate.is_off and gate.stays_off, has_count]
-    key += [gate.is_slow, gate.limit.takes_long]
+    key += [gate.is_slow, gate.limit.is_long]
     if state not in (State.BUS_OFF, State.SETTLING):
         key.append(min(gate.under_way.frames, 2))
     if state is State.SLOW:

@@ -21,7 +21,7 @@ class FakePort:
     """A port whose interface can be removed. It has no method for sending."""
 
     opened: list["FakePort"]
-    gone = False
+    is_gone = False
     state = CanState.UNKNOWN
     overruns = 0
 
@@ -60,7 +60,7 @@ def test_missing_interface_is_tried_at_most_each_half_second(
         looked.append(clock.now)
         raise RunError("cannot be opened")
 
-    FakePort.opened[0].gone = True
+    FakePort.opened[0].is_gone = True
     monkeypatch.setattr(bus_listener, "open_can", refuse)
     for _ in range(100):
         assert listener.receive(0.05) == []

@@ -412,7 +412,7 @@ def test_adapter_that_fails_while_it_is_read_is_opened_again(bench: Bench) -> No
     bench.start()
     bench.turn(100)
     before = bench.port
-    before.gone = True
+    before.is_gone = True
     bench.can.serve(bench.now)
     assert not bench.can.is_open
     bench.turn(600)
@@ -598,7 +598,7 @@ def test_adapter_with_rare_failures_is_opened_after_the_shortest_pause(
     for _ in range(5):
         bench.turn(500)
         failed = bench.port
-        failed.gone = True
+        failed.is_gone = True
         bench.can.serve(bench.now)
         assert not bench.can.is_open
         assert CAN_FD not in bench.world.handlers

@@ -215,7 +215,7 @@ def test_only_data_frames_with_wanted_ids_are_received(port: CanPort, fake: Fake
 def test_port_is_drained_when_nothing_waits(port: CanPort, fake: FakeSocket) -> None:
     port.set_receive_ids({1})
     fake.inbox = [packet(1), packet(ERROR | 0x04, b"\0\x10")] * RECEIVE_LIMIT
-    found = [(len(port.receive()), port.drained) for _ in range(3)]
+    found = [(len(port.receive()), port.is_drained) for _ in range(3)]
     assert found == [(RECEIVE_LIMIT // 2, False), (RECEIVE_LIMIT // 2, False), (0, True)]
 
 
@@ -228,12 +228,12 @@ def test_error_does_not_end_reception(port: CanPort, fake: FakeSocket, number: i
     fake.inbox = [packet(1, b"a"), number, packet(1, b"b")]
     assert frames_of(port) == [CanFrame(1, b"a")]
     assert port.state is (CanState.UNKNOWN if number == errno.EIO else CanState.DOWN)
-    assert port.gone is (number == errno.ENODEV)
+    assert port.is_gone is (number == errno.ENODEV)
     assert frames_of(port) == [CanFrame(1, b"b")]
     assert port.send(CanFrame(2, b"")) is (Sent.GONE if number == errno.ENODEV else Sent.OK)
     fake.fault = errno.ENODEV
     port.set_receive_ids({1})
-    assert port.gone, "an interface may go while filters are set, too"
+    assert port.is_gone, "an interface may go while filters are set, too"
 
 
 def test_frames_are_sent_in_the_format_of_the_kernel(port: CanPort, fake: FakeSocket) -> None:
@@ -640,7 +640,7 @@ def test_adapter_that_fails_is_reported_as_gone(
         monkeypatch.setattr(port._bus, "recv", failing)
         assert readable(port), "the loop is woken"
         assert port.receive() == []
-        assert port.gone
+        assert port.is_gone
         assert port.state == CanState.DOWN
         wait_for(lambda: readers() == [], "the thread's end")
         assert port.send(CanFrame(2, b"")) is Sent.GONE
@@ -660,9 +660,9 @@ def test_frames_are_filtered_here_if_the_driver_cannot_filter(
         monkeypatch.setattr(port._bus, "set_filters", no_lists)
         port.set_receive_ids({1})
         assert asked == [[{"can_id": 1, "can_mask": 0x7FF, "extended": False}], None]
-        assert not port.gone
+        assert not port.is_gone
         other.send(message(2))
         other.send(message(1))
         assert receive(port, 1) == [CanFrame(1, b"")]
         port.set_receive_ids({2})
-        assert port.gone
+        assert port.is_gone

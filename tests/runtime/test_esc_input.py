@@ -261,7 +261,7 @@ def test_unplugged_port_is_logged_once_until_it_is_back(
     def is_unplugged(path: str, _protocol: object) -> Port:
         raise NoPort(f"{path}: no such serial port.")
 
-    esc._noted.restored = True
+    esc._noted.is_restored = True
     bench.lose(0, SECOND)
     with monkeypatch.context() as patch:
         patch.setattr(esc_input, "SerialPort", is_unplugged)
@@ -388,7 +388,7 @@ def test_settings_changed_by_another_program_are_restored(core_language: str) ->
             assert turns.watch([(port.fileno(), select.POLLIN, 0)])
             turns.leave()
             turns.close()
-            return not turns.inputs[0].restored
+            return not turns.inputs[0].is_restored
 
         try:
             assert hold()

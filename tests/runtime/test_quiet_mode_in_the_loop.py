@@ -204,12 +204,12 @@ def test_interface_that_returns_in_quiet_mode_gets_no_frame(
     caplog.set_level(logging.INFO)
     bench = Bench(monkeypatch, shipped_canopen([1]))
     bench.run(QUIET_AFTER_S + 20)
-    bench.world.bus.gone = True
+    bench.world.bus.is_gone = True
     bench.world.bus.came(0x601, bytes.fromhex("4000100000000000"))
     bench.world.there = False
     bench.run(3)
     assert bench.loop.can.port is None
-    bench.world.bus.gone = False
+    bench.world.bus.is_gone = False
     bench.world.there = True
     assert bench.run(60) == []
     assert bench.loop.can.is_open

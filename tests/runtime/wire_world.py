@@ -75,7 +75,7 @@ def live(speed: int) -> bytes:
 class Wire:
     """A serial port with scheduled bytes. The speed in a frame is the number of the frame."""
 
-    drained = True
+    is_drained = True
     settings = bytes(range(64))
 
     def __init__(self, world: "World", number: int) -> None:
@@ -146,7 +146,7 @@ class Wire:
         count = min(self.waiting, most)
         data = bytes(self._bytes[self._read : self._read + count])
         self._read += count
-        self.drained = not self.waiting
+        self.is_drained = not self.waiting
         return data
 
     @property
@@ -236,7 +236,7 @@ class Bus(CanPort):
         while self.waits_to_be_read and len(found) < limit:
             frame, at = self.inbox.pop(0)
             found.append((frame, at + self.clock_error))
-        self.drained = not self.waits_to_be_read
+        self.is_drained = not self.waits_to_be_read
         return found
 
     @property

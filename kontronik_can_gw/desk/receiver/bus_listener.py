@@ -92,7 +92,7 @@ class BusListener:
         config = self._config
         is_socketcan = config.interface == "socketcan"
         has_fault = is_socketcan and fault_of(config.channel) != 0
-        if self._port is not None and (has_fault or self._port.gone):
+        if self._port is not None and (has_fault or self._port.is_gone):
             self.close()
         if self._port is None:
             try:
@@ -109,7 +109,7 @@ class BusListener:
         if self._port is None:
             return []
         frames = [frame for frame, _ in self._port.receive(_MAX_AT_ONCE)]
-        if self._port.gone:
+        if self._port.is_gone:
             self.close()
             self.problem = f"CAN interface {self._config.channel}: was lost. Trying again."
         elif frames:

@@ -251,7 +251,7 @@ class CanLink:
 
     def serve(self, now: int, events: int = select.POLLIN) -> None:
         """Receive frames. Call it when the port is readable, or writable again."""
-        self._noted.served = True
+        self._noted.is_served = True
         if self.port is None:
             return
         if events & select.POLLOUT:
@@ -260,7 +260,7 @@ class CanLink:
         if events & select.POLLIN:
             since = self._poller.times.before if self._is_drained else 0
             frames = self.port.receive()
-            self._is_drained = self.port.drained
+            self._is_drained = self.port.is_drained
             self._gateway.status.received_frames += len(frames)
             for frame, received_ns in frames:
                 if received_ns is None:
@@ -314,7 +314,7 @@ class CanLink:
         if port.overruns:
             self._gateway.receive_overrun(now)
         port.overruns = 0
-        if port.gone:
+        if port.is_gone:
             self._lost(Sent.GONE, now)
         else:
             self.controller.follow(port, now)

@@ -40,7 +40,7 @@ class CanPort(ABC):
 
     def __init__(self) -> None:
         self.state = CanState.UNKNOWN
-        self.gone = False
+        self.is_gone = False
         """True if the interface was removed or its driver failed. It must be opened again."""
         self.bus_off_count = 0
         """Number of times that the controller entered bus-off. The reader may set it back to 0."""
@@ -49,7 +49,7 @@ class CanPort(ABC):
 
         They are lost in the controller, or because they were not read in time.
         """
-        self.drained = True
+        self.is_drained = True
         """True if the last ``receive`` left no frame, including frames that it does not return."""
         self.count_fd = -1
         """Descriptor of the file with the number of ``frames_left``, or -1 if there is none."""
@@ -131,7 +131,7 @@ class CanPort(ABC):
         Also ends if ``clock`` returns a time after ``latest``, because the process was suspended
         meanwhile. Returns the number of accepted frames and the last result.
         """
-        if self.gone:
+        if self.is_gone:
             self.state = CanState.DOWN
             return 0, Sent.GONE
         count, answer = self._send_each(frames, clock, latest)

@@ -151,7 +151,7 @@ class DriverPort(CanPort):
 
     def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
         frames = self._frames.take(limit)
-        self.drained = len(frames) < limit
+        self.is_drained = len(frames) < limit
         if self._has_failed():
             self.state = CanState.DOWN
         self._note_drops()
@@ -183,11 +183,11 @@ class DriverPort(CanPort):
             with contextlib.suppress(Exception):  # drivers raise exceptions of any kind
                 self._bus.set_filters(wanted)
                 return
-        self.gone = True
+        self.is_gone = True
 
     def _has_failed(self) -> bool:
-        self.gone = self.gone or self._failed
-        return self.gone
+        self.is_gone = self.is_gone or self._failed
+        return self.is_gone
 
     def _drops(self) -> int:
         return self._dropped

@@ -130,11 +130,11 @@ class SocketCanPort(CanPort):
         try:
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed)
         except OSError:  # the interface was removed
-            self.gone = True
+            self.is_gone = True
 
     def receive(self, limit: int = RECEIVE_LIMIT) -> Received:
         frames: Received = []
-        self.drained = True
+        self.is_drained = True
         for _ in range(limit):
             try:
                 data, ancillary, _, _ = self._socket.recvmsg(_FD.size, _ANCILLARY_SIZE)
@@ -143,7 +143,7 @@ class SocketCanPort(CanPort):
             except OSError as error:
                 if error.errno in (errno.ENETDOWN, errno.ENODEV):
                     self.state = CanState.DOWN
-                    self.gone = self.gone or error.errno == errno.ENODEV
+                    self.is_gone = self.is_gone or error.errno == errno.ENODEV
                 break
             is_fd = len(data) != _CLASSIC.size
             if is_fd:
@@ -159,7 +159,7 @@ class SocketCanPort(CanPort):
                 frame = CanFrame(can_id & ~EXTENDED, content[:size], bool(can_id & EXTENDED), is_fd)
                 frames.append((frame, _monotonic(ancillary)))
         else:
-            self.drained = False
+            self.is_drained = False
             self._note_drops()  # so many frames may have overflowed the kernel's queue
         return frames
 

@@ -112,7 +112,7 @@ class EscPort:
         noted.undrained_ns = NEVER
         noted.is_plain = False
         noted.settings[:] = port.settings
-        noted.restored = False
+        noted.is_restored = False
         port.discard()  # the time of arrival of older bytes is unknown
         self.port = port
         self.identity = port.identity()
@@ -149,7 +149,7 @@ class EscPort:
         """Read the port, and hand its bytes to the gateway. Call it when the port is readable."""
         noted = self._noted
         port = self.port
-        noted.served = True
+        noted.is_served = True
         if port is None:
             return
         try:
@@ -167,7 +167,7 @@ class EscPort:
             since = noted.undrained_ns
             if since == NEVER:
                 since = max(noted.empty_ns, self._poller.times.before)
-            if port.drained:
+            if port.is_drained:
                 noted.undrained_ns = NEVER
             else:
                 # The bytes cannot have arrived faster than the wire transmits them.
@@ -197,7 +197,7 @@ class EscPort:
         ``report`` logs the change.
         """
         if self.port is not None and not self.port.settings_hold():
-            self._noted.restored = True
+            self._noted.is_restored = True
 
     def report(self, now: int) -> None:
         """Count line errors; log restored settings, and the reason if no telemetry is received."""
@@ -206,8 +206,8 @@ class EscPort:
         counts = self.port.line_errors()
         if counts is not self._counted:
             self._count(counts)
-        if self._noted.restored:
-            self._noted.restored = False
+        if self._noted.is_restored:
+            self._noted.is_restored = False
             text = (
                 f"{self.name}: another program changed the settings of {self.port.path}: "
                 f"restored to {self._protocol.line}"

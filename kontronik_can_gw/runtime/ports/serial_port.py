@@ -79,7 +79,7 @@ class SerialPort:
         self._real_path = os.path.realpath(path)
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
-        self.drained = True
+        self.is_drained = True
         """True if the last ``read`` left no bytes in the kernel."""
         try:
             mode = termios.tcgetattr(self._fd)
@@ -112,13 +112,13 @@ class SerialPort:
         try:
             data = os.read(self._fd, READ_SIZE)
         except BlockingIOError:
-            self.drained = True
+            self.is_drained = True
             return b""
         except OSError as error:
             raise PortLost(error.strerror or str(error)) from None
         if not data:
             raise PortLost("unplugged")
-        self.drained = not self._poll.poll(0)
+        self.is_drained = not self._poll.poll(0)
         return data
 
     def settings_hold(self) -> bool:

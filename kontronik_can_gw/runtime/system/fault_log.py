@@ -38,7 +38,7 @@ class _Condition:
         """Times of the last begins."""
         self.count = 0
         """Number of begins that were not logged."""
-        self.flaps = False
+        self.is_flapping = False
 
 
 class FaultLog:
@@ -74,11 +74,11 @@ class FaultLog:
         if quiet:
             return
         condition.begins.append(now)
-        if condition.flaps:
+        if condition.is_flapping:
             condition.count += 1
             return
         if len(condition.begins) == FLAPPING and now - condition.begins[0] < MINUTE:
-            condition.flaps = True
+            condition.is_flapping = True
             text = (
                 f"{text.removesuffix('.')}. "
                 "This happens often. The next line appears after a minute without it."
@@ -100,7 +100,7 @@ class FaultLog:
             return
         lasted_ns = now - condition.begun
         condition.begun = None
-        if not condition.flaps:
+        if not condition.is_flapping:
             self.log(logging.INFO, f"{text}, after {duration(lasted_ns)}{counts}")
 
     def forget(self, name: str) -> None:
@@ -121,14 +121,14 @@ class FaultLog:
     def advance(self, now: int) -> None:
         """Log the conditions that have stopped flapping."""
         for name, condition in self._known.items():
-            if condition.flaps and now - condition.begins[-1] >= MINUTE:
+            if condition.is_flapping and now - condition.begins[-1] >= MINUTE:
                 lasts = condition.begun is not None
                 state = f"It still lasts: {condition.reason}" if lasts else "It has ended."
                 text = (
                     f"{name}: happened {condition.count} more times, but no longer often. {state}"
                 )
                 self.log(logging.INFO, text)
-                condition.flaps = False
+                condition.is_flapping = False
                 condition.count = 0
                 condition.begins.clear()
 
