@@ -179,7 +179,7 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
         more, bits = output.traffic(is_worst=True)
         worst += bits / can.bitrate
         worst_frames += more
-    core, why_python = make_core(loaded.core_settings, 0)
+    core = make_core(loaded.core_settings, 0)
     node_ids: list[int | None] = []
     setup = canopen_setup(loaded)
     if setup is not None:
@@ -211,6 +211,6 @@ def document(path: Path, loaded: Loaded, warnings: list[str]) -> dict[str, Any]:
         "outputs": {each.name: lines for each in loaded.outputs if (lines := each.lines())},
         "canopen_nodes": node_ids,
         "core": core.language,
-        "core_reason": why_python or None,
+        "core_reason": core.note or None,
         "record_ring_bytes": ring_size(config),
     }

@@ -171,9 +171,9 @@ def _has_low_voltage(machine: Machine) -> bool:
 def _outputs(findings: Findings, loaded: Loaded) -> None:
     """Report the core that would run, and warnings."""
     findings.add("config", "ok", file=loaded.config.file)
-    core, reason = make_core(loaded.core_settings, 0)
-    case = "python" if reason else "ok"
-    findings.add("config.core", case, core=in_words(core.language, reason))
+    core = make_core(loaded.core_settings, 0)
+    case = "python" if core.note else "ok"
+    findings.add("config.core", case, core=in_words(core.language, core.note))
     for warning in (*loaded.layout.warnings, *loaded.warnings):
         findings.add("config.warning", "any", warning=warning)
 

@@ -192,7 +192,7 @@ class _Run:
         loop.open()
         for warning in warnings:
             log.warning("%s", warning)
-        log.info("%s", in_words(gateway.core.language, gateway.core_note))
+        log.info("%s", in_words(gateway.core.language, gateway.core.note))
         for esc, _ in loaded.damaged:
             gateway.parameters_damaged(esc, time.monotonic_ns())
         return loop

@@ -44,7 +44,7 @@ class Core(OutputHost, Protocol):
     language: str
     """``Python`` or ``C``."""
     note: str
-    """The reason why Python works on live frames although the core is in C, or ""."""
+    """The reason why Python works on live frames, or "" if only the core in C does."""
     followers: Sequence[Follower]
     link_changes: list[int]
     """ESCs whose link state, layout or device changed. The owner empties the list."""

@@ -18,13 +18,9 @@ class PythonCore:
     """The core in plain Python. See ``core.interface.Core`` for its methods."""
 
     language = "Python"
-    note = ""
 
-    def __init__(
-        self,
-        settings: CoreSettings,
-        now: int,
-    ) -> None:
+    def __init__(self, settings: CoreSettings, now: int, note: str = "") -> None:
+        self.note = note
         self.escs: list[EscStream] = [EscStream(esc, now) for esc in settings.escs]
         self.status = GatewayStatus(esc_count=len(settings.escs), started_ns=now, heard_ns=now)
         self.messages = Messages(settings, self.escs, self.status, now)

@@ -7,7 +7,7 @@ Bytes, received CAN frames and time go in. CAN frames to send and the next deadl
 from collections.abc import Sequence
 from dataclasses import replace
 
-from kontronik_can_gw.core.interface import Core, Follower, OnEvent
+from kontronik_can_gw.core.interface import Follower, OnEvent
 from kontronik_can_gw.core.output import NodeOutput, NodeState
 from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.core.settings import CoreSettings
@@ -37,28 +37,19 @@ class Gateway(FrameSource):
     ) -> None:
         layout = settings.layout
         slots = sum([maker.slots for maker in outputs])
-        made = make_core(replace(settings, slots=slots), now)
-        core: Core = made.core
+        core = make_core(replace(settings, slots=slots), now)
         super().__init__(core, tuple([maker.make(core, now) for maker in outputs]), layout)
-        self.why_python = made.why
-        """The reason why the core in Python runs, or "" if the one in C runs."""
         self.layout = layout.fingerprint if layout.messages else None
         """The fingerprint of the messages, as in a DBC of ``dbc -c``. None without messages."""
         self.escs = self.core.escs
         self.status = self.core.status
         self.node_outputs = [each for each in self.outputs if isinstance(each, NodeOutput)]
-        """False if only messages are sent. Then the ids to receive never change."""
         self.core.followers = [
             *[Follower(each.events, each.on_event) for each in self.outputs],
             Follower(Event.QUIET, _quiet_follower(self)),
         ]
         self.conflicts = IdConflicts(self.core.own_ids, self.outputs)
         self._being_saved: list[tuple[int, NodeOutput]] = []
-
-    @property
-    def core_note(self) -> str:
-        """The reason why Python works on live frames, or "" if only the core in C does."""
-        return self.why_python or self.core.note
 
     # --- start and end
 
@@ -95,8 +86,7 @@ class Gateway(FrameSource):
     def take_link_changes(self) -> list[int]:
         """Return the ESCs whose link state, layout or device changed since the last call."""
         changes = self.core.link_changes
-        if changes:
-            self.core.link_changes = []
+        self.core.link_changes = []
         return changes
 
     # --- received frames

@@ -2,7 +2,7 @@
 
 import os
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from kontronik_can_gw.core.interface import Core
 from kontronik_can_gw.core.python_core import PythonCore
@@ -11,13 +11,6 @@ from kontronik_can_gw.native.objects import fault, shared_object
 
 PURE = "KONTRONIK_PURE"
 """Environment variable: 1 asks for the core in Python."""
-
-
-class Made(NamedTuple):
-    """A core. ``why`` explains why it is the core in Python, and is "" for the core in C."""
-
-    core: Core
-    why: str
 
 
 @cache
@@ -39,10 +32,7 @@ def library() -> tuple[Any, str]:
         return None, str(error)
 
 
-def make_core(
-    settings: CoreSettings,
-    now: int,
-) -> Made:
+def make_core(settings: CoreSettings, now: int) -> Core:
     """Return the core in C if it can run with these settings, else the core in Python."""
     found, why = library()
     if found is not None:
@@ -50,11 +40,10 @@ def make_core(
         from kontronik_can_gw.native.rows import NotInCore
 
         try:
-            core = NativeCore(found, settings, now)
-            return Made(core, "")
+            return NativeCore(found, settings, now)
         except NotInCore as error:
             why = str(error)
-    return Made(PythonCore(settings, now), why)
+    return PythonCore(settings, now, why)
 
 
 def give_back() -> None:

@@ -158,7 +158,7 @@ class Loop:
         times = self._poller.times
         now = times.polled
         late = self._poller.late
-        is_late = late > self.can.transmitter.max_turn_ns()
+        is_late = late > self.can.transmitter.max_turn_ns
         if is_late:
             self._follow_hold_up(late, now)
         if is_late or ready or is_due:
@@ -211,9 +211,8 @@ class Loop:
         if gateway.outputs:
             self._follow_outputs(now)
         can.transmit(now)
-        changes = gateway.take_link_changes()
-        if changes:
-            for index in dict.fromkeys(changes):
+        if gateway.core.link_changes:
+            for index in dict.fromkeys(gateway.take_link_changes()):
                 self.escs[index].log.follow_link(now)
         return now
 

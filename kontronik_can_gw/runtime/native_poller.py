@@ -137,7 +137,7 @@ class NativePoller(Poller):
         request.leave = leave
         request.period = period
         request.check_period = can.gate.period_ns
-        request.max_turn = can.transmitter.max_turn_ns()
+        request.max_turn = can.transmitter.max_turn_ns
         request.bus = port.fileno()
         request.count_fd = port.count_fd
         request.frame_size = port.frame_size

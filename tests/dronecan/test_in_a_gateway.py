@@ -228,7 +228,7 @@ def test_measurements_do_not_need_python() -> None:
     """Iterations in C continue: the core sends the measurements, and Python sends once a second."""
     bench = Bench(2, extended_hz=20)
     if bench.gateway.core.language != "C":
-        pytest.skip(bench.gateway.core_note)
+        pytest.skip(bench.gateway.core.note)
     followed: list[int] = []
     followers = [*bench.gateway.core.followers]
     follower = followers[0]  # the output's; the last one is the gateway's own

@@ -78,16 +78,16 @@ def frames(core):
 
 
 settings = CoreSettings(escs, layout)
-made = make_core(settings, 0)
+core = make_core(settings, 0)
 folder = Path("firmware")
 folder.mkdir()
 for name, text in exported(settings, "licence").items():
     (folder / name).write_text(text)
 (folder / "uart.bin").write_bytes(b"".join(stream(WireLayout.V4)))
 print(json.dumps({
-    "why": made.why,
+    "why": core.note,
     "in Python": frames(PythonCore(settings, 0)),
-    "in C": frames(made.core),
+    "in C": frames(core),
 }))
 """
 

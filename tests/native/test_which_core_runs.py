@@ -73,8 +73,8 @@ def why(layout: MessageLayout = EMPTY, **settings: object) -> str:
     """Return why a gateway with one ESC has the Python core, or ""."""
     esc = replace(EscSettings(), **settings)  # type: ignore[arg-type]
     gateway = Gateway(CoreSettings([esc], layout), 0)
-    assert gateway.core.language == ("Python" if gateway.why_python else "C")
-    return gateway.why_python
+    assert gateway.core.language == ("Python" if gateway.core.note else "C")
+    return gateway.core.note
 
 
 @needs_c

@@ -39,6 +39,8 @@ class Transmitter:
     ) -> None:
         self.queue = TransmitQueue(gateway.status)
         self.gate = Gate(_shortest_timeout_ns(gateway), config.restart_after_ns)
+        self.max_turn_ns = min(MAX_LATE_NS, self.gate.timeout_ns)
+        """The age at which a frame is too old to be sent, from the iteration's start."""
         self.ask_restart: Callable[[str], None] = interface_restart.request
         self.reports = GateReports(config, self.gate, gateway.status, conditions)
         self._gateway = gateway
@@ -65,10 +67,6 @@ class Transmitter:
             Act.STALLED: self.reports.report_stall,
             Act.SLOW: self.reports.report_slow,
         }
-
-    def max_turn_ns(self) -> int:
-        """Return the age at which a frame is too old to be sent, from the iteration's start."""
-        return min(MAX_LATE_NS, self.gate.timeout_ns)
 
     @property
     def is_idle(self) -> bool:
@@ -103,6 +101,7 @@ class Transmitter:
         gate = self.gate
         gateway = self._gateway
         gate.timeout_ns = _shortest_timeout_ns(gateway)
+        self.max_turn_ns = min(MAX_LATE_NS, gate.timeout_ns)
         is_limited = gateway.is_limited
         self._is_after_advance = True
         if gate.is_quiet != gateway.status.is_quiet:
@@ -151,7 +150,7 @@ class Transmitter:
         if not frames:
             gate.refused_since = NEVER
             return None
-        count, answer = port.send_all(frames[:most], self._clock, now + self.max_turn_ns())
+        count, answer = port.send_all(frames[:most], self._clock, now + self.max_turn_ns)
         self.queue.remove(frames, count)
         if count:
             self._status.sent_frames += count
@@ -190,7 +189,7 @@ class Transmitter:
             gate.no_first_frame(now)
             self.work(now)
             return None
-        count, answer = port.send_all((frame,), self._clock, now + self.max_turn_ns())
+        count, answer = port.send_all((frame,), self._clock, now + self.max_turn_ns)
         if not count:
             self._gateway.not_sent(now)
             if answer is Sent.LATE:

@@ -27,8 +27,8 @@ class GatewayFacts(NamedTuple):
     """As Gateway.layout."""
     core: str
     """The language of the core."""
-    core_note: str
-    """As Gateway.core_note."""
+    core_reason: str
+    """As Core.note."""
 
 
 def gateway_facts(gateway: Gateway) -> GatewayFacts:
@@ -45,7 +45,7 @@ def gateway_facts(gateway: Gateway) -> GatewayFacts:
         outputs=outputs,
         layout=gateway.layout,
         core=gateway.core.language,
-        core_note=gateway.core_note,
+        core_reason=gateway.core.note,
     )
 
 

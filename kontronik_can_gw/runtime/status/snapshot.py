@@ -108,7 +108,7 @@ def snapshot(moment: Moment, before: Moment | None = None) -> str:
             "escs_ok": status.escs_ok,
             "layout": gateway.layout,
             "core": gateway.core,
-            "core_reason": gateway.core_note or None,
+            "core_reason": gateway.core_reason or None,
         },
         "can": {
             **moment.can._asdict(),
