@@ -83,7 +83,8 @@ class Housekeeping:
         self._alive_due = 0 if notifier.watchdog_ns is not None else None
         """Time of the next keep-alive. None if the service manager expects none."""
         self._notify_due = 0
-        self._is_ready = False
+        self.is_ready = False
+        """True if the service manager was told that the gateway runs."""
         self._collect_due: int | None = None
         self._process = ProcessFacts()
         self._process_due = 0
@@ -228,12 +229,12 @@ class Housekeeping:
         return "; ".join(words)
 
     def report_ready(self) -> None:
-        """Report once to the service manager that the gateway runs.
+        """Report to the service manager that the gateway runs.
 
         An interface whose failure ends the gateway must be open before.
         """
-        if not (self._is_ready or self._can.must_open):
-            self._is_ready = True
+        if not self._can.must_open:
+            self.is_ready = True
             self._notifier.ready(self.status_words())
 
     def _notify(self, now: int) -> None:
@@ -241,7 +242,6 @@ class Housekeeping:
 
         A port that the loop does not serve in time is a reason to restart the process.
         """
-        self.report_ready()
         if now >= self._notify_due and self._notifier.is_present:
             self._notify_due = now + STATUS_NS
             self._notifier.status(self.status_words())

@@ -26,7 +26,7 @@ from kontronik_can_gw.runtime.status.statistics import Statistics
 from kontronik_can_gw.runtime.system.fault_log import FaultLog, duration
 from kontronik_can_gw.runtime.system.sd_notify import Notifier
 from kontronik_can_gw.runtime.system.worker import Handover
-from kontronik_can_gw.times import MS, SECOND
+from kontronik_can_gw.times import SECOND
 
 if TYPE_CHECKING:
     from kontronik_can_gw.runtime.files.recorder import Recorder
@@ -183,7 +183,7 @@ class Loop:
         own_due = min(
             self.can.due, self._housekeeping.wake_due, *[esc.retry.due for esc in self._lost]
         )
-        period = self.can.gate.quarter_ns - MS  # a wait is rounded up to a millisecond
+        period = self.can.transmitter.max_wait_ns()
         if gateway.status.is_quiet:
             period = _QUIET_PERIOD_NS
         if self._native is not None and self._native.can_run(self.can):
@@ -211,6 +211,8 @@ class Loop:
         if gateway.outputs:
             self._follow_outputs(now)
         can.transmit(now)
+        if not self._housekeeping.is_ready:
+            self._housekeeping.report_ready()
         if gateway.core.link_changes:
             for index in dict.fromkeys(gateway.take_link_changes()):
                 self.escs[index].log.follow_link(now)

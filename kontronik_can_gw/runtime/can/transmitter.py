@@ -68,6 +68,13 @@ class Transmitter:
             Act.SLOW: self.reports.report_slow,
         }
 
+    def max_wait_ns(self) -> int:
+        """Return the longest wait of the loop: a quarter of the shortest timeout of the ESCs.
+
+        It is a millisecond less, because a wait is rounded up to a millisecond.
+        """
+        return _shortest_timeout_ns(self._gateway) // 4 - MS
+
     @property
     def is_idle(self) -> bool:
         """True if no frame waits, is held or is limited, and the port refused none."""
