@@ -125,6 +125,7 @@ class Bench:
             self.gateway,
             self.world.poller,
             FaultLog(),
+            esc_at=lambda _path: None,
             clock=lambda: self.clock,
         )
 
@@ -436,6 +437,7 @@ def drone(kernel: Kernel, node_id: int = 42) -> Bench:
         made.gateway,
         World().poller,
         FaultLog(),
+        esc_at=lambda _path: None,
         clock=lambda: made.clock,
     )
     return made

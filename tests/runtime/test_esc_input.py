@@ -8,6 +8,7 @@ import logging
 import os
 import select
 import termios
+import time
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -77,7 +78,9 @@ class Bench:
         self.poller = World().poller
         self.lost: set[EscPort] = set()
         self.escs = [
-            EscPort(n, path, self.gateway, self.poller, self.conditions, self.lost)
+            EscPort(
+                n, path, self.gateway, self.poller, self.conditions, self.lost, time.monotonic_ns
+            )
             for n, path in enumerate(paths)
         ]
         for esc in self.escs:

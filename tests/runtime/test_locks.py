@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -110,7 +111,16 @@ def test_second_gateway_with_the_same_node_or_messages_is_refused(what: str) -> 
     try:
         for _ in range(2):
             gateway = Gateway(loaded.core_settings, 0, outputs=loaded.outputs)
-            sides.append(CanLink(loaded.config.can, gateway, Poller(), FaultLog()))
+            sides.append(
+                CanLink(
+                    loaded.config.can,
+                    gateway,
+                    Poller(),
+                    FaultLog(),
+                    lambda _path: None,
+                    time.monotonic_ns,
+                )
+            )
         sides[0].open(0, wait=True)
         names = "messages from 680h on|CANopen node 42|29-bit ids with 2Ah .*"
         said = f"CAN can0: ({names}): used by another"
@@ -172,7 +182,14 @@ def waiting_gateway(monkeypatch: pytest.MonkeyPatch) -> CanLink:
     gateway = Gateway(loaded.core_settings, 0, outputs=loaded.outputs)
     monkeypatch.setattr(can_opener, "open_can", lambda _config: Bus(World()))
     monkeypatch.setattr(can_controller, "link_monitor", lambda _name: None)
-    link = CanLink(loaded.config.can, gateway, World().poller, FaultLog())
+    link = CanLink(
+        loaded.config.can,
+        gateway,
+        World().poller,
+        FaultLog(),
+        lambda _path: None,
+        time.monotonic_ns,
+    )
     link.open(0, wait=False)
     gateway.start(0)
     return link

@@ -7,7 +7,6 @@ import contextlib
 import errno
 import logging
 import select
-import time
 from collections.abc import Callable
 
 from kontronik_can_gw.config.keys import CanConfig
@@ -46,8 +45,8 @@ class CanLink:
         gateway: Gateway,
         poller: Poller,
         conditions: FaultLog,
-        esc_at: Callable[[str], str | None] = lambda _path: None,
-        clock: Callable[[], int] = time.monotonic_ns,
+        esc_at: Callable[[str], str | None],
+        clock: Callable[[], int],
     ) -> None:
         self.config = config
         self.port: CanPort | None = None
@@ -61,7 +60,6 @@ class CanLink:
         self.opening_condition = f"CAN {config.channel}: opening"
         self._opening_since: int | None = None
         """Start of the opening by the opener's thread. None if the thread does not open."""
-        self._clock = clock
         self._retry = Retry(MAX_RETRY_NS)
         self._own_ids = IdLocks(config, gateway, conditions)
         self._receive_ids: frozenset[int] | None = None

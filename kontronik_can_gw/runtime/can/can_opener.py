@@ -36,9 +36,7 @@ class CanOpener:
        ``close_port`` closes at once.
     """
 
-    def __init__(
-        self, config: CanConfig, esc_at: Callable[[str], str | None] = lambda _path: None
-    ) -> None:
+    def __init__(self, config: CanConfig, esc_at: Callable[[str], str | None]) -> None:
         self._config = config
         self._esc_at = esc_at
         self._results: Handover[CanPort | RunError] = Handover()

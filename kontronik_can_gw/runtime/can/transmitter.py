@@ -3,7 +3,6 @@
 It owns the frames that wait, passes events of the port to the gate, and does the gate's acts.
 """
 
-import time
 from collections.abc import Callable, Sequence
 
 from kontronik_can_gw.config.keys import CanConfig
@@ -35,7 +34,7 @@ class Transmitter:
         gateway: Gateway,
         conditions: FaultLog,
         prove: Callable[[int], None],
-        clock: Callable[[], int] = time.monotonic_ns,
+        clock: Callable[[], int],
     ) -> None:
         self.queue = TransmitQueue(gateway.status)
         self.gate = Gate(_shortest_timeout_ns(gateway), config.restart_after_ns)

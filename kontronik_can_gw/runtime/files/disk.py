@@ -40,10 +40,10 @@ def write_all(fd: int, data: bytes) -> None:
         rest = rest[os.write(fd, rest) :]
 
 
-def write_new(path: Path, data: bytes, mode: int, is_synced: bool = False) -> None:
+def write_new(path: Path, data: bytes, mode: int) -> None:
     """Write a new file with these permissions. An old file of that name is replaced.
 
-    With ``is_synced``, the content is forced to the disk. Raises OSError if that fails.
+    The content is forced to the disk. Raises OSError if that fails.
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     try:
@@ -54,8 +54,7 @@ def write_new(path: Path, data: bytes, mode: int, is_synced: bool = False) -> No
     try:
         os.fchmod(fd, mode)  # os.open applies the umask to the mode
         write_all(fd, data)
-        if is_synced:
-            os.fsync(fd)
+        os.fsync(fd)
     finally:
         os.close(fd)
 

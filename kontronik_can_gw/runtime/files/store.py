@@ -133,7 +133,7 @@ class ParameterStore:
         temporary = _temporary(path)
         try:
             _make_folder(self._folder)
-            write_new(temporary, data, 0o600, is_synced=True)
+            write_new(temporary, data, 0o600)
             temporary.replace(path)
             sync_folder(self._folder)
         except OSError as error:

@@ -1,7 +1,6 @@
 """Opens, reads and reopens the serial port of one ESC, and logs the faults of that ESC."""
 
 import logging
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -52,7 +51,7 @@ class EscPort:
         poller: Poller,
         conditions: FaultLog,
         lost: "set[EscPort]",
-        clock: Callable[[], int] = time.monotonic_ns,
+        clock: Callable[[], int],
     ) -> None:
         self.path = path
         self.port: SerialPort | None = None

@@ -185,7 +185,7 @@ class Statistics:
                 raise OSError(errno.EINVAL, "it is not a regular file")  # e.g. /dev/null
             if not self._is_ours and has_other_content(path):
                 raise OSError(errno.EEXIST, NOT_OURS)
-            write_new(temporary, data, 0o644, is_synced=True)
+            write_new(temporary, data, 0o644)
             os.replace(temporary, path)  # noqa: PTH105
         except OSError as error:
             with contextlib.suppress(OSError):
