@@ -29,7 +29,6 @@ _IN_CORE = 7
 _IN_OFFLINE = 3
 """Numbers of structures whose sizes kcg_sizes and kcg_offline_sizes return."""
 _head = struct.Struct("=IBBB").unpack_from
-_new = tuple.__new__
 
 
 class WrongObject(RuntimeError):
@@ -68,7 +67,5 @@ def frames_in(raw: memoryview, begin: int, count: int) -> list[CanFrame]:
         number, length, flags, page = _head(raw, at)
         data = bytes(raw[at + 8 : at + 8 + length])
         can_id = number & ~EXTENDED
-        is_extended = number >= EXTENDED
-        fields = (can_id, data, is_extended, flags != 0, page, False, False)
-        frames.append(_new(CanFrame, fields))
+        frames.append(CanFrame(can_id, data, number >= EXTENDED, flags != 0, page))
     return frames

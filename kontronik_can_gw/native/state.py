@@ -101,8 +101,7 @@ class NativeEsc(EscTelemetry):
         known[kind] = None
         if getattr(state, has_data):
             form, data_type = self._forms[kind & 1]
-            fields = form.unpack_from(getattr(state, body))
-            known[kind] = tuple.__new__(data_type, fields)
+            known[kind] = data_type(*form.unpack_from(getattr(state, body)))
         return known[kind]
 
 

@@ -29,20 +29,16 @@ class GateReports:
         self._conditions = conditions
 
     def end_faults(self, now: int) -> None:
-        """Log the end of faults."""
+        """Log the end of faults that are over. In quiet mode they are forgotten."""
         gate = self._gate
-        if not gate.is_slow and self._conditions.is_on(self.slow):
-            text = f"CAN {self._channel}: the bus takes all frames in time"
-            self._end(self.slow, text, now)
-        if not gate.is_stalled and self._conditions.is_on(self.stalled):
-            self._end(self.stalled, f"CAN {self._channel}: frames are sent again", now)
-
-    def _end(self, name: str, text: str, now: int) -> None:
-        """End a fault. If quiet mode ended it, ``text`` would not be true."""
-        if self._gate.is_quiet:
-            self._conditions.forget(name)
-        else:
-            self._conditions.end(name, text, now)
+        for name, lasts, text in (
+            (self.slow, gate.is_slow, "the bus takes all frames in time"),
+            (self.stalled, gate.is_stalled, "frames are sent again"),
+        ):
+            if gate.is_quiet and not lasts:
+                self._conditions.forget(name)
+            elif not lasts:
+                self._conditions.end(name, f"CAN {self._channel}: {text}", now)
 
     def report_quiet(self, is_quiet: bool, now: int) -> None:
         """Log the begin or the end of quiet mode."""

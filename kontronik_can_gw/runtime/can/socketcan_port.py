@@ -168,8 +168,7 @@ class SocketCanPort(CanPort):
 
     def _follow(self, can_id: int, detail: int) -> None:
         if can_id & _ERR_BUS_OFF:
-            self.bus_off_count += self.state is not CanState.BUS_OFF
-            self.state = CanState.BUS_OFF
+            self.note_state(CanState.BUS_OFF)
         elif can_id & _ERR_RESTARTED:
             self.state = CanState.ERROR_ACTIVE
         elif can_id & _ERR_CONTROLLER:
@@ -187,8 +186,6 @@ class SocketCanPort(CanPort):
         clock: Callable[[], int],
         latest: int,
     ) -> tuple[int, Sent]:
-        send = self._socket.send
-        pack = _CLASSIC.pack
         count = 0
         for can_id, data, extended, fd, _, remote, _ in frames:
             if clock() > latest:
@@ -200,9 +197,9 @@ class SocketCanPort(CanPort):
             if fd:
                 packed = _FD.pack(can_id, len(data), _FD_BRS, data)
             else:
-                packed = pack(can_id, len(data), data)
+                packed = _CLASSIC.pack(can_id, len(data), data)
             try:
-                send(packed)
+                self._socket.send(packed)
             except OSError as error:
                 answer = self._send_again(packed, error)
                 if answer is not Sent.OK:
