@@ -213,12 +213,7 @@ class Address(NamedTuple):
             )
             part = folder / f"{_FILE}.part"
             content = json.dumps(address._asdict())
-            write_new(
-                part,
-                content.encode(),
-                0o600,
-                is_synced=True,
-            )
+            write_new(part, content.encode(), 0o600)
             part.replace(folder / _FILE)
         except OSError as error:
             raise RunError(
