@@ -42,9 +42,9 @@ OPTIONS = (
 EPILOG = (
     "Without options it shows all gateways of this user and of the system. "
     "For a live view run: watch kontronik-can-gw status. Exit codes: 0 running and healthy; "
-    "1 running, but there is no telemetry of an ESC, nothing gets onto the CAN bus, CANopen "
-    "parameters cannot be stored, or one of several gateways does not answer; 2 wrong usage; "
-    "3 no gateway runs, or it has not answered for 3 s."
+    "1 running, but there is no telemetry of an ESC, nothing gets onto the CAN bus or the bus is "
+    "slow, CANopen parameters or captures cannot be stored, or one of several gateways does not "
+    "answer; 2 wrong usage; 3 no gateway runs, or it has not answered for 3 s."
 )
 
 

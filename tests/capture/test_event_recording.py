@@ -374,6 +374,7 @@ def test_lost_entries_are_counted_while_the_disk_fails_for_long(tmp_path: Path) 
     flight.it.close()
 
 
+@pytest.mark.promise("full-disk")
 @pytest.mark.parametrize("ends_before", [False, True])
 def test_capture_states_exactly_what_a_full_disk_has_cost(
     ends_before: bool,

@@ -152,6 +152,7 @@ def test_new_part_begins_after_the_configured_time(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@pytest.mark.promise("full-disk")
 @pytest.mark.parametrize("trouble", ["full", "broken", "removed", "no folder"])
 def test_writing_to_a_failed_disk_is_tried_again(
     trouble: str,

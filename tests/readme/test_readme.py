@@ -93,7 +93,9 @@ def test_each_fault_has_the_place_that_reports_it() -> None:
 
 
 def test_every_command_is_documented() -> None:
-    assert all(f"`kontronik-can-gw {command}" in README for command in COMMANDS)
+    reference = (PROJECT / "docs/reference/commands.md").read_text(encoding="utf-8")
+    assert all(f"\n## {command}\n" in reference for command in COMMANDS)
+    assert "(docs/reference/commands.md)" in README
 
 
 def test_every_documented_command_exists() -> None:

@@ -412,6 +412,7 @@ def test_damaged_file_exists_at_every_instant(
 OF_THE_FILE = [(step, TEMPORARY) for step in ("create", "write", "fsync", "close", "rename")]
 
 
+@pytest.mark.promise("full-disk")
 @pytest.mark.parametrize("failing", [*OF_THE_FILE, ("fsync", "params")])
 def test_failure_at_any_step_is_reported_and_leaves_a_complete_file(
     tmp_path: Path,

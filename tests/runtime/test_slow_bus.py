@@ -77,6 +77,7 @@ def test_each_message_of_a_slow_bus_waits_for_two_departures_of_each_at_most(
 
 
 @in_both_cores
+@pytest.mark.promise("slow-bus")
 def test_slow_bus_is_reported_once_and_its_end_too(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

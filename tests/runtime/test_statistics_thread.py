@@ -183,6 +183,7 @@ def test_disk_that_does_not_answer_is_reported_once_until_it_does(
     until(lambda: [each.begins for each in statistics.reports(0)] == [False])
 
 
+@pytest.mark.promise("full-disk")
 @pytest.mark.parametrize(
     ("trouble", "said"),
     [("no folder", "No such file"), ("no file", "not a regular file"), ("full", "No space left")],
