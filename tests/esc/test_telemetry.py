@@ -264,6 +264,7 @@ def test_info_frame_is_late_after_its_own_time_out() -> None:
 
 
 @pytest.mark.promise("round-once")
+@pytest.mark.promise("energy")
 def test_energy_and_run_time_agree_with_an_independent_integration() -> None:
     telemetry = esc()
     watt_seconds = 0.0
@@ -286,6 +287,7 @@ def test_energy_and_run_time_agree_with_an_independent_integration() -> None:
     assert 30 < run_seconds < 50
 
 
+@pytest.mark.promise("energy")
 def test_energy_does_not_count_in_a_gap_and_survives_a_loss() -> None:
     telemetry = alive(SECOND)
     read(telemetry, live(), SECOND + 100 * MS)
