@@ -143,7 +143,7 @@ def _convert(args: argparse.Namespace, form: str, opened_by: OpenInput) -> int:
         # the rows of a pipe cannot be read again, but only text can be used without its end
         is_part_kept = recording.stream is not None and form in ON_SCREEN
         with writing(
-            args.output, force=args.force, is_part_kept=is_part_kept, has_handler=False
+            args.output, force=args.force, is_part_kept=is_part_kept, is_handling_signals=False
         ) as out:
             name = f"{Path(args.input).name or recording.name} to {form}:"
             out.watch = partial(watched, name=name, data_on_screen=args.output == "-")

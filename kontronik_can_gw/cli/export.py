@@ -106,7 +106,7 @@ def _write_all(folder: Path, files: dict[str, str], *, force: bool) -> None:
             outputs = []
             for name, text in files.items():
                 path = str(folder / name)
-                out = stack.enter_context(writing(path, force=force, has_handler=False))
+                out = stack.enter_context(writing(path, force=force, is_handling_signals=False))
                 outputs.append(out)
                 file = out.open()
                 file.write(text.encode())

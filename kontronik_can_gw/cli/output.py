@@ -110,24 +110,24 @@ def writing(
     *,
     force: bool,
     is_part_kept: bool = False,
-    has_handler: bool = True,
+    is_handling_signals: bool = True,
 ) -> Iterator[OutputFile]:
     """Open an output for writing. Raises RunError if it cannot be written.
 
     ``force``: an existing file is replaced. ``is_part_kept``: if writing fails, OUT.part stays.
-    ``has_handler``: SIGTERM, SIGINT and SIGHUP raise KeyboardInterrupt, which is reported.
+    ``is_handling_signals``: SIGTERM, SIGINT and SIGHUP raise KeyboardInterrupt, which is reported.
     Without it the caller handles them.
     """
     out = OutputFile(None if output == "-" else Path(output), force=force)
     out.is_part_kept = is_part_kept
     try:
         with ExitStack() as stack:
-            if has_handler:
+            if is_handling_signals:
                 stack.enter_context(stopping_on_signals(interrupt))
             stack.enter_context(out)
             yield out
     except KeyboardInterrupt:
-        if has_handler:
+        if is_handling_signals:
             say(stopped(output))
         raise
     except BrokenPipeError:

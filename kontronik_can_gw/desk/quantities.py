@@ -64,9 +64,9 @@ class Plot(NamedTuple):
 QUANTITIES = tuple(Quantity(source, **row) for source, row in _TABLES["monitor"].items())
 PLOTS = tuple(Plot(key, **row) for key, row in _TABLES["plots"].items())
 DRAWN = tuple(source for plot in PLOTS for source in plot.lines)
-MAXIMA: dict[str, tuple[str, int]] = _TABLES["maxima"]
+MAXIMA = {source: (label, digits) for source, (label, digits) in _TABLES["maxima"].items()}
 """Label and decimals by source."""
-MINIMA: dict[str, tuple[str, int]] = _TABLES["minima"]
+MINIMA = {source: (label, digits) for source, (label, digits) in _TABLES["minima"].items()}
 TILES: dict[str, str] = _TABLES["tiles"]
 """Label by source."""
 COUNTERS: dict[str, str] = _TABLES["counters"]

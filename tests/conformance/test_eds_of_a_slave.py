@@ -1,5 +1,6 @@
 """EDS files of other makers are accepted, or refused with the section and key of the mistake."""
 
+import inspect
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,10 @@ from simulated_slave import EDS, simulated_slave
 
 from kontronik_can_gw.canopen.eds import load
 from kontronik_can_gw.canopen.eds_changes import with_vendor_id
+from kontronik_can_gw.desk.conformance import run as run_module
 from kontronik_can_gw.desk.conformance.eds_file import EdsFile, read_eds
 from kontronik_can_gw.desk.conformance.run import chosen_items, run
+from kontronik_can_gw.desk.conformance.slave import Slave
 
 pytestmark = pytest.mark.promise("conformance")
 
@@ -57,6 +60,27 @@ def test_dummy_objects_are_not_read(tmp_path: Path) -> None:
     assert set(verdicts(eds, "od-each", "od-values", "sdo-write-to-a-constant").values()) == {
         "passed"
     }
+
+
+def test_items_of_an_array_need_its_first_entry(tmp_path: Path) -> None:
+    arrays = ("1003", "1010", "1011")
+    changes = [(f"[{index}sub1]", f"[{index}sub70]") for index in arrays]
+    eds = read_eds(eds_with(tmp_path, *changes), 1)
+    items = ("emcy-history", "store-", "restore-")
+    found = {name: verdict for name, verdict in verdicts(eds, *items).items() if "lss" not in name}
+    assert len(found) >= 7
+    assert set(found.values()) == {"not supported"}
+
+
+def test_every_procedure_of_a_module_is_an_item() -> None:
+    written = set()
+    for module in run_module._GROUPS.values():
+        for name, procedure in vars(module).items():
+            if getattr(procedure, "__module__", "") != module.__name__ or name.startswith("_"):
+                continue
+            if inspect.get_annotations(procedure) == {"slave": Slave, "return": str}:
+                written.add(procedure)
+    assert {item.run for item in run_module.all_items()} == written
 
 
 def test_eds_without_device_info_is_judged(tmp_path: Path) -> None:

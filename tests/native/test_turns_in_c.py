@@ -38,6 +38,7 @@ from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode
 from kontronik_can_gw.esc.kontronik.fields import LiveData
 from kontronik_can_gw.esc.telemetry import EscSettings, Event
 from kontronik_can_gw.frames import EXTENDED, CanFrame
+from kontronik_can_gw.gateway.gate_table import PASSING
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import Sent
 from kontronik_can_gw.native import load
@@ -373,6 +374,7 @@ def test_sending_to_a_busy_driver_is_retried_every_two_milliseconds(
     it.bus.answer = Sent.BUSY
     it.run(1.2)
     assert 50 < len(it.bus.refused) <= 110
+    assert it.loop.can.gate.state in PASSING, "a busy driver is no outage"
     # These are the first attempt with a new frame, and an attempt every 2 ms.
     it.bus.answer = Sent.OK
     it.bus.sent.clear()

@@ -326,9 +326,9 @@ def _version_of(library: str) -> str | None:
 
 
 def _program_digest() -> str:
-    """Return the SHA-256 of all modules of this program, so that changes of them are noticed."""
+    """Return the SHA-256 of the program's modules and tables, so that changes are noticed."""
     package = Path(__file__).resolve().parents[2]
     found = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
+    for path in sorted((*package.rglob("*.py"), *package.rglob("*.toml"), *package.rglob("*.tsv"))):
         found.update(os.fsencode(path.relative_to(package)) + b"\0" + path.read_bytes())
     return found.hexdigest()

@@ -60,7 +60,7 @@ class Item(NamedTuple):
     needs: str = ""
     """Item that shows that the slave has the service whose silence this item requires, or ""."""
     objects: Sequence[str] = ()
-    """Objects that the EDS must have, for example "1016h:2"."""
+    """Objects that the EDS must have, for example "1017h" or "1016h:2"."""
 
 
 def all_items() -> list[Item]:
@@ -163,7 +163,7 @@ def _run_item(slave: Slave, item: Item, reason: str) -> Result:
         if item.group != "EDS":
             slave.restart(RESET_NODE)
         for place in item.objects:
-            index, _, sub = place.split()[-1].partition("h")
+            index, _, sub = place.partition("h")
             if not slave.has(int(index, 16), int(sub[1:] or 0)):
                 raise Skipped(f"the EDS does not have {place}")
         if item.group == "LSS":

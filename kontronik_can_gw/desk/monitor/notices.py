@@ -37,10 +37,10 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, NoticeKind]
     if monitor.is_replay and not source.is_file:
         text = "REPLAY: the gateway plays a recording; these are not values of a live ESC."
         yield text, NoticeKind.REPLAY
-    has_none = not monitor.view.frames
+    has_no_frame = not monitor.view.frames
     if source.problem:
         yield source.problem, NoticeKind.FAULT
-    elif source.has_ended and has_none:
+    elif source.has_ended and has_no_frame:
         text = f"{source.name} contains no frame of {monitor.file}."
         yield f"{text} Give the DBC of its frames (-c, --dbc).", NoticeKind.FAULT
     elif monitor.is_quiet:
@@ -51,7 +51,7 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, NoticeKind]
         yield f"no {frames}", NoticeKind.FAULT
         for hint in source.hints:
             yield hint, NoticeKind.HINT
-    elif has_none:
+    elif has_no_frame:
         yield f"waiting for {frames} ...", NoticeKind.WAITING
     count = monitor.gateway.number("esc_count")
     known = len(monitor.escs)

@@ -98,5 +98,5 @@ def entity(source: str, member: Published) -> dict[str, Any]:
 
 def _display_name(source: str) -> str:
     words = [word.upper() if word in _SOURCES["capitals"] else word for word in source.split("_")]
-    text = " ".join(words).replace("escs", "ESCs")
+    text = " ".join("ESCs" if word == "escs" else word for word in words)
     return text[0].upper() + text[1:]

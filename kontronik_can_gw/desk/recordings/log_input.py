@@ -1,4 +1,4 @@
-"""Reads the log of a CAN tool as a recording. The content of its first lines shows its format."""
+"""Finds the format of a recording by its first lines, and reads the log of a CAN tool as one."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
