@@ -1,9 +1,8 @@
 """Transmit PDOs: objects 180xh and 1A0xh, and the rules by which a master may change them.
 
 See CiA 301, 7.2.2 and 7.5.2.37/38, and 7.2.5 for SYNC (1005h, 1019h), which starts PDOs of types 0
-to 240. Each PDO is one of the core's slots, and the core sends it. The
-bytes of a PDO come from a compiled plan, like the bytes of a DBC message, directly from the ESC's
-snapshot.
+to 240. Each PDO is one of the core's slots, and the core sends it. The bytes of a PDO come from a
+compiled plan, like the bytes of a DBC message, directly from the ESC's snapshot.
 
 The event of types 254 and 255 is new data of a mapped object: a UART frame, a second, or a
 download. A PDO that carries a status object (errors, operating state, link status) is sent when one

@@ -77,7 +77,7 @@ class Stored:
 def encode(stored: Stored) -> bytes:
     """Return the text of the file in ASCII, which is the same for equal content.
 
-    ValueError for an impossible node-ID.
+    ValueError for an impossible node-ID. All keys are objects of 1000h to FFFFh.
     """
     node_id = stored.node_id
     if node_id is not None and not _is_node_id(node_id):

@@ -54,7 +54,7 @@ def keys_of(copy: Copy, patterns: Sequence[str]) -> list[str]:
     """Return the keys of [dbc.e2e] that apply to a message, the most specific one first."""
     both = (copy.name, copy.message.name)
     named = [name for name in both if name in patterns]
-    matching = [pattern for pattern in patterns if fnmatch.filter(both, pattern)]
+    matching = [each for each in patterns if any(fnmatch.fnmatchcase(name, each) for name in both)]
     return list(dict.fromkeys([*named, *matching]))
 
 

@@ -34,7 +34,7 @@ POLL_NS = 2 * MS
 """Time between two looks while frames are limited, and between two attempts on a busy port."""
 _NO_ROWS: tuple[Row, ...] = ()
 _CLOSELY = (State.SLOW, State.MOVING, State.FIRST)
-"""States in which the interface's count is looked at every POLL_NS."""
+"""States in which the interface's count is looked at every POLL_NS, in FIRST only at its begin."""
 
 
 def _rows() -> dict[tuple[State, Event], tuple[Row, ...]]:
@@ -62,7 +62,7 @@ class Gate(GateState):
         self._step(Event.OPENING, now)
 
     def opened(self, count: int, now: int, is_socket: bool = True) -> None:
-        """Follow an interface that was opened. ``count`` is its number of sent frames."""
+        """Follow an interface that was opened. ``count``: its sent frames, or UNCOUNTED."""
         self.is_socket = is_socket
         self.is_off = False
         self._forget()
@@ -149,7 +149,7 @@ class Gate(GateState):
         self._step(Event.NO_FIRST, now)
 
     def look(self, count: int, queued: int, now: int) -> None:
-        """Take the interface's count of sent frames, and own frames in the kernel's queue."""
+        """Take the count of sent frames, or UNCOUNTED, and own frames in the kernel's queue."""
         under_way = self.under_way
         was_late = self.is_late(now)
         has_moved = under_way.look(count, queued, now)

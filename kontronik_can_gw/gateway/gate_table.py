@@ -20,7 +20,7 @@ MAX_PAUSE_NS = 10 * SECOND
 NO_FIRST_NS = 10 * SECOND
 """Longest wait for a departure if no first frame exists. Then one frame is tried."""
 UNLIMITED = 32
-"""More frames than kernel, driver and controller hold: a limit that limits nothing."""
+"""More frames than are under way as a rule: a limit that limits nothing."""
 
 
 class State(Enum):

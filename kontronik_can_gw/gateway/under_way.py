@@ -3,7 +3,6 @@
 from collections import deque
 from typing import Any
 
-from kontronik_can_gw.gateway.gate_table import UNLIMITED
 from kontronik_can_gw.times import NEVER
 
 UNCOUNTED = -1
@@ -14,13 +13,12 @@ class UnderWay:
     """The frames that the interface has accepted and that have not left it.
 
     The interface's count includes frames of other programs, which share its queue. So a frame has
-    left only if it has also left the kernel's queue. A count of 0 is usual before the first frame
-    has left. It is taken as ``UNCOUNTED`` after more frames than kernel and driver can hold.
+    left only if it has also left the kernel's queue.
     """
 
     def __init__(self) -> None:
         self.count = 0
-        """The interface's last count of sent frames."""
+        """The interface's last count of sent frames, or ``UNCOUNTED``."""
         self.frames = 0
         """Number of frames under way."""
         self.looked = 0
@@ -50,8 +48,6 @@ class UnderWay:
         ``queued`` is the number of own frames in the kernel's queue. A count that is smaller than
         before was reset. Then the frames under way are forgotten.
         """
-        if not count and (self.count == UNCOUNTED or self.frames - queued > UNLIMITED):
-            count = UNCOUNTED
         moved = count - self.count
         self.count = count
         if count == UNCOUNTED or moved < 0:

@@ -132,12 +132,10 @@ static int is_late(kcg_turns *t)
     if (now < d->check_due)
         return 0;
     int64_t count = frames_left(t), queued = frames_queued(t);
-    if (!count && d->count == UNCOUNTED)
-        count = UNCOUNTED;
     int64_t frames = d->older + d->newer, left = count - d->count;
-    int has_left = left != 0;
     if (count == UNCOUNTED || left < 0)
         left = frames;
+    int has_left = left != 0;
     left = left < frames - queued ? left : frames - queued;
     left = left > 0 ? left : 0;
     int64_t of_older = left < d->older ? left : d->older;

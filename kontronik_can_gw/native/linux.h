@@ -95,7 +95,7 @@ typedef struct {
    C only returns if a frame is under way for longer than a check period. The owner writes the
    fields before kcg_begin and reads them after a run. NEVER is KCG_DRAINED. */
 typedef struct {
-    int64_t count;       /* The interface's number of sent frames at the last check. */
+    int64_t count;       /* Number of sent frames at the last check, or -1 if unknown. */
     int64_t still_since; /* Frames are under way and none has left since then, or NEVER. */
     int64_t checked;     /* Time of the last check. */
     int64_t check_due;   /* Time of the next check, or NEVER. */

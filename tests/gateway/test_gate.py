@@ -112,16 +112,20 @@ def test_interface_that_has_sent_nothing_yet_is_blocked() -> None:
     assert not gate.room(TIMEOUT + SECOND)
 
 
-def test_driver_whose_count_stays_0_has_no_count_after_many_frames() -> None:
-    """It has taken more frames than it can hold."""
+def test_bus_that_is_unplugged_from_the_start_stays_blocked_however_many_frames_fit() -> None:
+    """The driver takes each first frame, and holds more frames than the kernel."""
     gate = Gate(TIMEOUT)
     gate.opened(0, 0)
-    for now in (0, 100 * MS):
-        gate.accepted(UNLIMITED + 1, now)
-        gate.look(0, 0, now + 1)
-    gate.accepted(1, SECOND)
-    gate.look(0, 0, 2 * SECOND)
-    assert gate.state is State.OPEN
+    gate.accepted(6, 0)
+    for now in range(0, 100 * SECOND, 20 * MS):
+        gate.look(0, 0, now)
+        gate.advance(now)
+        if gate.wants_first_frame(now):
+            gate.accepted_first(now)
+        if now >= SECOND:
+            assert gate.is_stalled
+            assert not gate.room(now)
+    assert gate.under_way.frames > UNLIMITED + 1
 
 
 def test_wait_on_a_slow_bus_ends_in_the_future_although_a_refused_frame_may_be_tried() -> None:
