@@ -3,8 +3,8 @@
     python random_command_lines.py FOLDER SEED FIRST COUNT
 
 Runs COUNT command lines of a seed, from number FIRST on. Each runs in a child of this process,
-which has loaded all libraries. A fault is a traceback, an exit code that README does not list, or a
-command that does not end. FOLDER must be empty and writable for everybody.
+which has loaded all libraries. A fault is a traceback, an exit code that docs/operation.md does not
+list, or a command that does not end. FOLDER must be empty and writable for everybody.
 
 It is safe to run on any machine. The commands run as an ordinary user with an empty home folder,
 and with a systemctl that does nothing. Sockets reach this machine only, and no CAN interface. Each
@@ -32,7 +32,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+OPERATION = Path(__file__).resolve().parents[2] / "docs" / "operation.md"
 STOP_S = 0.3
 """A command that is still running after this time gets SIGINT, as by Ctrl-C."""
 CPU_LIMIT_S = 5
@@ -153,11 +153,12 @@ def command_line(rng: random.Random, known: Sequence[Grammar]) -> list[str]:
 
 
 def accepted_codes() -> set[int]:
-    """Return the exit codes that README lists."""
-    text = README.read_text(encoding="utf-8")
-    found = re.search(r"^Exit codes: (.*?)\n\n", text, re.MULTILINE | re.DOTALL)
+    """Return the exit codes that docs/operation.md lists."""
+    section = OPERATION.read_text(encoding="utf-8").partition("\n## Exit codes\n")[2]
+    table = section.partition("\n## ")[0]
+    found = {int(code) for code in re.findall(r"^\| (\d+) \|", table, re.MULTILINE)}
     assert found
-    return {int(code) for code in re.findall(r"(?:^|; )(\d+) ", found[1].replace("\n", " "))}
+    return found
 
 
 def prepare(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""No command line ends with a traceback or an exit code that README does not list."""
+"""No command line ends with a traceback or an exit code that docs/operation.md does not list."""
 
 import os
 import shutil
@@ -27,7 +27,7 @@ def open_folder() -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("part", range(PARTS))
-def test_random_command_lines_end_with_a_code_of_the_readme(part: int, open_folder: Path) -> None:
+def test_random_command_lines_end_with_a_listed_code(part: int, open_folder: Path) -> None:
     number = COUNT // PARTS
     script = Path(__file__).with_name("random_command_lines.py")
     words = [open_folder, SEED, part * number, number]
