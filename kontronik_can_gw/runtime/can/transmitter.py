@@ -38,8 +38,6 @@ class Transmitter:
     ) -> None:
         self.queue = TransmitQueue(gateway.status)
         self.gate = Gate(_shortest_timeout_ns(gateway), config.restart_after_ns)
-        self.max_turn_ns = min(MAX_LATE_NS, self.gate.timeout_ns)
-        """The age at which a frame is too old to be sent, from the iteration's start."""
         self.ask_restart: Callable[[str], None] = interface_restart.request
         self.reports = GateReports(config, self.gate, gateway.status, conditions)
         self._gateway = gateway
@@ -66,6 +64,11 @@ class Transmitter:
             Act.STALLED: self.reports.report_stall,
             Act.SLOW: self.reports.report_slow,
         }
+
+    @property
+    def max_turn_ns(self) -> int:
+        """The age at which a frame is too old to be sent, from the iteration's start."""
+        return min(MAX_LATE_NS, self.gate.timeout_ns)
 
     def max_wait_ns(self) -> int:
         """Return the longest wait of the loop: a quarter of the shortest timeout of the ESCs.
@@ -107,7 +110,6 @@ class Transmitter:
         gate = self.gate
         gateway = self._gateway
         gate.timeout_ns = _shortest_timeout_ns(gateway)
-        self.max_turn_ns = min(MAX_LATE_NS, gate.timeout_ns)
         is_limited = gateway.is_limited
         self._is_after_advance = True
         if gate.is_quiet != gateway.status.is_quiet:
