@@ -46,7 +46,7 @@ def notices(monitor: Monitor, source: Source) -> Iterator[tuple[str, NoticeKind]
     elif monitor.is_quiet:
         yield "the gateway is quiet: it sends again when an ESC is heard.", NoticeKind.HINT
     elif source.is_file:
-        pass  # a pause of a recording is no fault
+        pass  # a recording may have pauses without a fault
     elif monitor.silent_ns >= SILENCE_NS:
         yield f"no {frames}", NoticeKind.FAULT
         for hint in source.hints:
