@@ -50,14 +50,14 @@ def did_you_mean(
     return f" Known: {', '.join(map(show, names))}." if or_known else ""
 
 
-_WORD = re.compile(r"[^\W\d_]+")
-_BORDER_IN_CAMEL_CASE = re.compile(r"(?<=[a-z])(?=[A-Z])")
+_WORD = r"[^\W\d_]+"
+_BORDER_IN_CAMEL_CASE = r"(?<=[a-z])(?=[A-Z])"
 _SHORTEST_START = 3
 """Letters that the beginning of a word needs, to stand for the word."""
 
 
 def _words(name: str) -> list[str]:
-    return _WORD.findall(_BORDER_IN_CAMEL_CASE.sub("_", name).casefold())
+    return re.findall(_WORD, re.sub(_BORDER_IN_CAMEL_CASE, "_", name).casefold())
 
 
 def _with_words(name: str, known: Iterable[str]) -> list[str]:

@@ -72,12 +72,13 @@ _TEXT_VALUE = re.compile(rf"^([ \t]*BA_\s+){_NAME}(\s[^\";]*){_NAME}(\s*;)", re.
 
 
 _OTHER_FORMATS = (
-    (re.compile(r"\s*FormatVersion\s*="), "a PCAN Symbol file (.sym)", "cantools convert"),
-    (re.compile(r"\s*<[^\0]{0,2000}?\bNetworkDefinition\b"), "a KCD", "cantools convert"),
-    (re.compile(r"\s*<[^\0]{0,2000}?\bAUTOSAR\b"), "an ARXML", "canconvert"),
-    (re.compile(r"[^\0]{0,2000}?\[DATABASE_VERSION\]"), "a DBF of BUSMASTER", "canconvert"),
+    ("FormatVersion", "=", "a PCAN Symbol file (.sym)", "cantools convert"),
+    ("<", "NetworkDefinition", "a KCD", "cantools convert"),
+    ("<", "AUTOSAR", "an ARXML", "canconvert"),
+    ("", "[DATABASE_VERSION]", "a DBF of BUSMASTER", "canconvert"),
 )
-"""Beginnings of databases in other formats, their names, and the programs that convert them."""
+"""Beginnings of databases in other formats, a text near it, their names, and their converters."""
+_NEAR = 2000
 
 
 class LeftOut(NamedTuple):
@@ -154,14 +155,14 @@ def parse_database(
     return database
 
 
-_SYNTAX = re.compile(r'Invalid syntax at (line \d+, column \d+): "([A-Z_]*)')
+_SYNTAX = r'Invalid syntax at (line \d+, column \d+): "([A-Z_]*)'
 """An error of cantools: its place, and the keyword at the beginning of the line."""
 
 
 def _reason(error: Exception) -> str:
     """Return the reason of an error of cantools, in one line."""
     text = " ".join(str(error)[:_MAX_REASON].split()) or type(error).__name__
-    found = _SYNTAX.match(text)
+    found = re.match(_SYNTAX, text)
     if found is None:
         return f"cannot be read as a DBC: {text}"
     where, keyword = found.groups()
@@ -172,8 +173,9 @@ def _reason(error: Exception) -> str:
 
 def _refuse_other_formats(text: str, path: str) -> None:
     """Raise UserError with the converter for a database in another format."""
-    for beginning, name, program in _OTHER_FORMATS:
-        if beginning.match(text):
+    start = text.lstrip()[:_NEAR]
+    for beginning, near, name, program in _OTHER_FORMATS:
+        if start.startswith(beginning) and near in start:
             package = "cantools" if program.startswith("cantools") else "canmatrix"
             raise UserError(
                 f"{path}: is {name}, not a DBC. Convert it with the Python package {package}: "
