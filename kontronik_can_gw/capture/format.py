@@ -43,6 +43,7 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.entry_kinds import EntryKind as EntryKind
 from kontronik_can_gw.frames import EXTENDED, CanFrame
 from kontronik_can_gw.status import COUNTERS
+from kontronik_can_gw.times import SECOND
 
 SUFFIX = ".kcap"
 MAGIC = b"KCB1"
@@ -68,6 +69,13 @@ _WITH_ARRIVAL = frozenset({EntryKind.BYTES, EntryKind.FRAME})
 
 CLOCK_FLAGS: Mapping[bool | None, int] = {None: 0, True: 1, False: 2}
 """Flags of a CLOCK entry, for a clock that is synchronised, not synchronised, or unknown."""
+
+
+SETTLE_NS = 10 * SECOND
+"""After this time, a replay without the beginning of its run has the state of the live run.
+
+ESCs send info data every five seconds or more often. Messages with several pages send each of them.
+"""
 
 
 class Entry(NamedTuple):

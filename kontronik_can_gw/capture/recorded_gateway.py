@@ -1,6 +1,6 @@
 """A gateway that passes all its calls to a recorder.
 
-A replay of the calls in their order gives the same frames (capture/replay.py).
+A replay of the calls in their order gives the same frames (desk/recordings/replay.py).
 """
 
 from collections.abc import Callable, Iterable, Sequence

@@ -12,7 +12,6 @@ from threading import Thread
 from typing import Protocol, Self
 
 from kontronik_can_gw.assembly.assemble import assemble, check_devices
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.core.settings import CoreSettings
@@ -20,6 +19,7 @@ from kontronik_can_gw.desk.receiver.bus_listener import BusListener
 from kontronik_can_gw.desk.receiver.unpacker import SignalReader
 from kontronik_can_gw.desk.recordings.inputs import Input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.replay import TimedFrame
 from kontronik_can_gw.esc.kontronik.simulator import (
     FLIGHT,
     Dropout,

@@ -3,7 +3,7 @@
 
    The core decodes, keeps the state and packs. This file has the loops around it. Rare entries
    (ports, the bus, settings, received frames) are left to the owner, which gives them to the same
-   core and then continues. The twins in Python are capture/replay.py
+   core and then continues. The twins in Python are desk/recordings/replay.py
    and, in desk/recordings, bytes_input.py (plain bytes), samples.py (rows), tables.py and
    can_logs/writer.py (text). */
 #ifndef KCG_OFFLINE_H

@@ -12,11 +12,11 @@ from kontronik_can_gw.assembly.assemble import assemble
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.capture.format import Entry, block, data_payload, json_payload
 from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
-from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.cli.recording import setup_of
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.core.settings import CoreSettings
 from kontronik_can_gw.desk.recordings.recording import Input, Sample
+from kontronik_can_gw.desk.recordings.replay import TimedFrame, in_order
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions, Faults, SimulatedEsc
 from kontronik_can_gw.esc.kontronik.states import Device
 from kontronik_can_gw.frames import CanFrame

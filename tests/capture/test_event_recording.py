@@ -8,9 +8,9 @@ from capture_bench import START, Bench, made
 
 from kontronik_can_gw.capture.format import Entry, EntryKind, read_numbers
 from kontronik_can_gw.capture.recorded_gateway import state_of
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
+from kontronik_can_gw.desk.recordings.replay import TimedFrame
 from kontronik_can_gw.runtime.files import event_recorder, recorder
 from kontronik_can_gw.runtime.files.event_recorder import EventRecorder, Ring
 from kontronik_can_gw.runtime.system.clock import ClockFacts

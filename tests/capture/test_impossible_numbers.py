@@ -18,8 +18,8 @@ from kontronik_can_gw.capture.format import (
     numbers_data,
 )
 from kontronik_can_gw.capture.limits import check_state
-from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.desk.recordings.replay import Replay
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.telemetry import MAX_COUNT, MAX_ENERGY
 from kontronik_can_gw.times import END_OF_TIME

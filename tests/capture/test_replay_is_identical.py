@@ -7,6 +7,7 @@ from capture_bench import START, Bench, made
 
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.capture.format import (
+    SETTLE_NS,
     VERSION,
     Block,
     Entry,
@@ -19,8 +20,8 @@ from kontronik_can_gw.capture.format import (
     read_json,
 )
 from kontronik_can_gw.capture.recorded_gateway import state_of
-from kontronik_can_gw.capture.replay import SETTLE_NS, Replay, TimedFrame
 from kontronik_can_gw.desk.recordings.inputs import open_input
+from kontronik_can_gw.desk.recordings.replay import Replay, TimedFrame
 from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import SECOND
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import kontronik_can_gw
 from kontronik_can_gw.assembly.assemble import assemble
-from kontronik_can_gw.capture.replay import in_order
 from kontronik_can_gw.cli import main
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.parse import parse
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
+from kontronik_can_gw.desk.recordings.replay import in_order
 from kontronik_can_gw.frames import CanFrame as CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue

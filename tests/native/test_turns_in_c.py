@@ -27,11 +27,11 @@ from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, EntryKind
 from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
-from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.core.output_setup import OutputSetup, ReadyOutput
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.recordings.replay import Replay
 from kontronik_can_gw.dronecan.nodes import Given
 from kontronik_can_gw.dronecan.setup import DronecanSetup
 from kontronik_can_gw.esc.kontronik.codec import WireLayout, encode

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import can
 
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.recordings.can_logs.writer import CanLogWriter
 from kontronik_can_gw.desk.recordings.inputs import Input, open_input
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
+from kontronik_can_gw.desk.recordings.replay import TimedFrame
 from kontronik_can_gw.frames import CanFrame
 
 Item = tuple[int, CanFrame, bool]

@@ -10,12 +10,12 @@ from command_line import run
 from log_files import opened
 from recordings import candump_log
 
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.desk.receiver.unpacker import SignalReader, Unpacker
 from kontronik_can_gw.desk.receiver.view import View
 from kontronik_can_gw.desk.recordings.can_logs.text import CandumpReader
 from kontronik_can_gw.desk.recordings.layouts import layout_of_dbc
+from kontronik_can_gw.desk.recordings.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.samples import RowsOfFrames
 from kontronik_can_gw.desk.recordings.stream import HEAD
 from kontronik_can_gw.frames import EXTENDED, CanFrame

@@ -12,10 +12,10 @@ from typing import Any
 
 from simulated_bus import flight
 
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.receiver.unpacker import SignalReader, Value
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
 from kontronik_can_gw.desk.recordings.recording import RowBlock
+from kontronik_can_gw.desk.recordings.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
 from kontronik_can_gw.desk.report.flight import Flight
 from kontronik_can_gw.esc.kontronik.simulator import EscOptions

@@ -19,9 +19,9 @@ from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, EntryKind
 from kontronik_can_gw.capture.recorded_gateway import RecordedGateway
-from kontronik_can_gw.capture.replay import Replay
 from kontronik_can_gw.config.keys import CanConfig
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.recordings.replay import Replay
 from kontronik_can_gw.esc.telemetry import EscSettings
 from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gate_table import TABLE, Row

@@ -15,10 +15,10 @@ from kontronik_can_gw.canopen.setup import CanopenSetup
 from kontronik_can_gw.canopen.storage import Stored
 from kontronik_can_gw.capture.format import Entry, EntryKind
 from kontronik_can_gw.capture.recorded_gateway import RecordedGateway, state_of
-from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.config.output_keys import DronecanConfig
 from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.core.settings import CoreSettings
+from kontronik_can_gw.desk.recordings.replay import Replay, TimedFrame
 from kontronik_can_gw.dronecan.nodes import Given
 from kontronik_can_gw.dronecan.setup import DronecanSetup
 from kontronik_can_gw.esc.telemetry import EscSettings

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from vcan_tools import GatewayProcess, configuration, feeding, recording, wait_for
 
-from kontronik_can_gw.capture.replay import SETTLE_NS
+from kontronik_can_gw.capture.format import SETTLE_NS
 from kontronik_can_gw.desk.recordings.inputs import open_input
 from kontronik_can_gw.times import SECOND
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.capture.format import Entry, EntryKind
-from kontronik_can_gw.capture.replay import TimedFrame, in_order
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.config.output_keys import DbcConfig
 from kontronik_can_gw.core.python_core import PythonCore
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc
 from kontronik_can_gw.desk.recordings.log_input import BYTES, UART_MAGIC, format_of
 from kontronik_can_gw.desk.recordings.played import PlayedInput
+from kontronik_can_gw.desk.recordings.replay import TimedFrame, in_order
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader, name_of
 from kontronik_can_gw.errors import UserError
 from kontronik_can_gw.esc.decoder import Counters, Reading

@@ -24,12 +24,12 @@ from kontronik_can_gw.capture.format import (
     read_json,
     read_numbers,
 )
-from kontronik_can_gw.capture.replay import Replay, TimedFrame
 from kontronik_can_gw.config.keys import shipped
 from kontronik_can_gw.core.header_parts import HeaderError
 from kontronik_can_gw.desk.recordings.layouts import BusLayout, layout_of_dbc, shown_by
 from kontronik_can_gw.desk.recordings.played import NO_MESSAGES, PlayedInput
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, ClockStep, timed
+from kontronik_can_gw.desk.recordings.replay import Replay, TimedFrame
 from kontronik_can_gw.desk.recordings.trusted_times import TRUSTS, TrustedTimes
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import counted, printable

@@ -7,7 +7,6 @@ from itertools import islice
 from pathlib import Path
 
 from kontronik_can_gw.capture.format import MAGIC
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.can_logs import asc, text
 from kontronik_can_gw.desk.recordings.fields import TableColumn
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
@@ -21,6 +20,7 @@ from kontronik_can_gw.desk.recordings.recording import (
     LogFrame,
     RowBlock,
 )
+from kontronik_can_gw.desk.recordings.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.samples import RowsOfFrames, fields_of_log
 from kontronik_can_gw.desk.recordings.stream import HEAD, Stream, StreamReader
 from kontronik_can_gw.errors import RunError, UserError

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 from kontronik_can_gw.assembly.capture_setup import CaptureSetup
 from kontronik_can_gw.capture.format import Entry
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.core.output import Output, OutputHost
 from kontronik_can_gw.core.output_setup import OutputMaker, ReadyOutput
 from kontronik_can_gw.core.settings import CoreSettings
@@ -28,6 +27,7 @@ from kontronik_can_gw.desk.recordings.recording import (
     Sample,
     timed,
 )
+from kontronik_can_gw.desk.recordings.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.samples import RowMaker
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.native import load

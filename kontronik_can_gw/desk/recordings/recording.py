@@ -9,10 +9,10 @@ from itertools import chain, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
 
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.desk.receiver.unpacker import SignalReader, Value
 from kontronik_can_gw.desk.recordings.fields import TableColumn, fields_of_values
 from kontronik_can_gw.desk.recordings.layouts import BusLayout
+from kontronik_can_gw.desk.recordings.replay import TimedFrame
 from kontronik_can_gw.desk.recordings.stream import Stream
 from kontronik_can_gw.desk.recordings.trusted_times import TrustedTimes
 from kontronik_can_gw.desk.words import duration

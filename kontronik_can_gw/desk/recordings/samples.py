@@ -13,12 +13,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, pairwise, repeat
 from typing import NamedTuple
 
-from kontronik_can_gw.capture.replay import TimedFrame
 from kontronik_can_gw.core.output import Output
 from kontronik_can_gw.desk.receiver.unpacker import Column, SignalReader, Value
 from kontronik_can_gw.desk.receiver.view import Freshness
 from kontronik_can_gw.desk.recordings.fields import ColumnType, Read, TableColumn, distinct
 from kontronik_can_gw.desk.recordings.recording import LATEST_NS, LogFrame, Sample
+from kontronik_can_gw.desk.recordings.replay import TimedFrame
 from kontronik_can_gw.esc.telemetry import EscSettings, EscTelemetry, Event
 from kontronik_can_gw.esc.values import VALUES, Group, Kind
 from kontronik_can_gw.frames import EXTENDED

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kontronik_can_gw.capture.format import (
+    SETTLE_NS,
     EntryKind,
     Packed,
     data_payload,
@@ -28,7 +29,6 @@ from kontronik_can_gw.capture.format import (
     read_json,
     read_numbers,
 )
-from kontronik_can_gw.capture.replay import SETTLE_NS
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.runtime.files.recorder import (
     STATE_NS,

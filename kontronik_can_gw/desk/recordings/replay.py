@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from kontronik_can_gw.capture.calls import CALL_OF, RecordedCall
 from kontronik_can_gw.capture.format import (
     RECORDED_COUNTERS,
+    SETTLE_NS,
     VERSION,
     Entry,
     EntryKind,
@@ -22,13 +23,6 @@ from kontronik_can_gw.frames import CanFrame
 from kontronik_can_gw.gateway.gateway import Gateway
 from kontronik_can_gw.gateway.transmit_queue import TransmitQueue
 from kontronik_can_gw.status import CanState, GatewayState
-from kontronik_can_gw.times import SECOND
-
-SETTLE_NS = 10 * SECOND
-"""After this time, a replay without the beginning of its run has the state of the live run.
-
-ESCs send info data every five seconds or more often. Messages with several pages send each of them.
-"""
 
 
 class TimedFrame(NamedTuple):
