@@ -542,10 +542,10 @@ def test_identical_frame_of_another_device_is_received() -> None:
     own_frames = OwnFrames()
     frame = CanFrame(0x680, b"same")
     own_frames.add(frame, 0)
-    assert [own_frames.is_own(frame) for _ in range(2)] == [True, False]
+    assert [own_frames.take(frame) for _ in range(2)] == [True, False]
     own_frames.add(frame, 0)
     own_frames.add(CanFrame(0x681, b""), 11 * SECOND)
-    assert not own_frames.is_own(frame), "it was lost ten seconds ago"
+    assert not own_frames.take(frame), "it was lost ten seconds ago"
 
 
 @pytest.mark.parametrize(

@@ -100,8 +100,8 @@ class OwnFrames:
                 self._expected.popleft()
             self._expected.append((now, _as_received(frame)))
 
-    def is_own(self, frame: CanFrame) -> bool:
-        """Return True if a received frame is our own. Returns True once for each sent frame."""
+    def take(self, frame: CanFrame) -> bool:
+        """Expect a frame no longer. Return True if it was expected, that is, if it is our own."""
         received = _as_received(frame)
         with self._lock:
             for index, (_, expected) in enumerate(self._expected):
@@ -207,7 +207,7 @@ class DriverPort(CanPort):
                 self._own_frames.add(frame, clock())
             answer = self._send_message(frame)
             if self._own_frames is not None and answer is not Sent.OK:
-                self._own_frames.is_own(frame)  # no longer expected
+                self._own_frames.take(frame)
             if answer is not Sent.OK:
                 return count, answer
         return len(frames), Sent.OK
@@ -243,7 +243,7 @@ class DriverPort(CanPort):
             return
         data = bytes(message.data)
         frame = CanFrame(message.arbitration_id, data, message.is_extended_id, message.is_fd)
-        if self._own_frames is not None and self._own_frames.is_own(frame):
+        if self._own_frames is not None and self._own_frames.take(frame):
             return
         # The origin of ``message.timestamp`` depends on the driver, so it is not used.
         if not self._frames.put((frame, time.monotonic_ns())):
