@@ -118,7 +118,7 @@ void kcg_row_event(kcg_offline *o, int esc, int events, int64_t now)
     }
 }
 
-/* --- calls of a recording (twin: desk/recordings/replay.py) ------------------------------------------- */
+/* --- calls of a recording (twin: desk/recordings/replay.py) -------------------------- */
 
 /* Follows the event that a call of the core returned, and all further ones. */
 static void follow(kcg_offline *o, int found, int64_t now)
