@@ -1,13 +1,16 @@
 """Captures around events: the ring, its captures, and the disk."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from capture_bench import START, Bench, made
 
 from kontronik_can_gw.capture.format import Entry, EntryKind, read_numbers
-from kontronik_can_gw.capture.recorded_gateway import state_of
+from kontronik_can_gw.capture.recorded_gateway import devices_of, state_of
 from kontronik_can_gw.config.keys import RecordConfig
 from kontronik_can_gw.desk.recordings.inputs import CaptureInput, open_input
 from kontronik_can_gw.desk.recordings.replay import TimedFrame
@@ -22,27 +25,75 @@ REMARKS = (EntryKind.LOST, EntryKind.CLOCK)
 BOTH = pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
 
 
+@dataclass(frozen=True)
+class HalfSecond:
+    """A part of the simulated flight, and the gateway's state after it."""
+
+    now: int
+    entries: Sequence[Entry]
+    state: dict[str, Any]
+    devices: list[dict[str, Any] | None]
+
+
+class Simulation:
+    """One flight, of which each half second is simulated once, when a test first needs it."""
+
+    def __init__(self) -> None:
+        self.bench = Bench(*made(2))
+        self.state = state_of(self.bench.gateway)
+        self._run = self.bench.running(3, wild=False)
+        self._parts: list[HalfSecond] = []
+        self._given = 0
+
+    def part(self, number: int) -> HalfSecond:
+        while len(self._parts) <= number:
+            now = self._run(0.5)
+            entries = self.bench.entries[self._given :]
+            self._given += len(entries)
+            gateway = self.bench.gateway
+            part = HalfSecond(now, entries, state_of(gateway), devices_of(gateway))
+            self._parts.append(part)
+        return self._parts[number]
+
+
+_simulations: dict[str, Simulation] = {}
+"""The flight with each core, by its language."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def released() -> Iterator[None]:
+    yield
+    _simulations.clear()
+
+
 @pytest.fixture(autouse=True)
-def asleep(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the recorder's thread sleep until the end."""
+def simulation(core_language: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the recorder's thread sleep until the end, and let a Flight use the core's flight."""
     monkeypatch.setattr(recorder, "PERIOD_S", 10_000)
     monkeypatch.setattr(recorder, "_CLOSE_S", 60)
+    monkeypatch.setattr(recorder, "state_of", attrgetter("state"))
+    monkeypatch.setattr(recorder, "devices_of", attrgetter("devices"))
+    language = core_language or "C"
+    if language not in _simulations:
+        _simulations[language] = Simulation()
+    Flight.simulation = _simulations[language]
 
 
 class Flight:
     """A simulated flight with a recorder, whose thread's work is done at the flight's time."""
 
+    simulation: Simulation
+
     def __init__(self, folder: Path, **settings: int) -> None:
         self.folder = folder
-        self.bench = Bench(*made(2))
-        known = {"created_ns": START, "state": state_of(self.bench.gateway)}
-        self._run = self.bench.running(3, wild=False)
+        self.bench = self.simulation.bench
+        known = {"created_ns": START, "state": self.simulation.state}
         self.now = START
         config = RecordConfig(**{"min_free_mb": 0} | settings)  # type: ignore[arg-type]
         self.it = EventRecorder(folder, config, 2, lambda: self.now)
         self.it.header = self.bench.setup.header() | known
         self.it.start(wait=True)
-        self._given = 0
+        self._flown = 0
         self.put: list[Entry] = []
         """All entries that the recorder was given."""
         put = self.it.put
@@ -56,11 +107,12 @@ class Flight:
     def fly(self, seconds: float) -> int:
         """Fly for some seconds. The recorder works twice a second. Return the time."""
         for _ in range(int(2 * seconds)):
-            self.now = self._run(0.5)
-            for entry in self.bench.entries[self._given :]:
+            part = self.simulation.part(self._flown)
+            self._flown += 1
+            self.now = part.now
+            for entry in part.entries:
                 self.it.put(*entry)
-            self._given = len(self.bench.entries)
-            self.it.note(self.bench.gateway, self.now)
+            self.it.note(cast(Any, part), self.now)
             self.it._work([])
         return self.now
 
