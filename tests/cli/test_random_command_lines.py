@@ -14,7 +14,8 @@ pytestmark = pytest.mark.promise("one-line")
 
 SEED = 41
 COUNT = 2000
-PARTS = 4
+PARTS = 2
+"""Each imports all libraries, which takes as long as a hundred command lines."""
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ import tomllib
 import zipfile
 from email import message_from_string
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import make_deb
 import pytest
@@ -51,6 +51,7 @@ Requires-Dist: bitstruct>=8.16.1
 Requires-Dist: python-can>=3.3.4
 Requires-Dist: matplotlib; extra == 'plot'
 """
+EPOCH = "1700000000"
 OWN = f"./usr/lib/{make_deb.NAME}/kontronik_can_gw/"
 
 if shutil.which("dpkg-deb") is None:
@@ -81,16 +82,30 @@ def inputs(folder: Path) -> tuple[Path, list[Path]]:
     ]
 
 
+class Built(NamedTuple):
+    """Packages, and the wheels that they are made of."""
+
+    wheel: Path
+    libraries: list[Path]
+    packages: list[Path]
+
+
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """Build the packages. Return their contents by architecture."""
+def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """Build the packages, which takes seconds."""
     folder = tmp_path_factory.mktemp("deb")
     wheel, libraries = inputs(folder)
     with pytest.MonkeyPatch.context() as patch:
         # The sources may be without a repository.
-        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-        packages = make_deb.make(wheel, libraries, folder)
-    return {path.stem.rpartition("_")[2]: path.read_bytes() for path in packages}
+        patch.setenv("SOURCE_DATE_EPOCH", EPOCH)
+        packages = make_deb.make(wheel, libraries, folder / "out")
+    return Built(wheel, libraries, packages)
+
+
+@pytest.fixture(scope="module")
+def made(built: Built) -> dict[str, bytes]:
+    """Return the contents of the packages by architecture."""
+    return {path.stem.rpartition("_")[2]: path.read_bytes() for path in built.packages}
 
 
 @pytest.mark.parametrize("is_git_installed", [True, False])
@@ -399,11 +414,8 @@ def test_bill_of_materials_lists_core_and_libraries(made: dict[str, bytes]) -> N
     assert set(depends[own["bom-ref"]]) == {each["bom-ref"] for each in bill["components"]}
 
 
-def test_bill_of_materials_is_beside_the_package_too(tmp_path: Path) -> None:
-    wheel, libraries = inputs(tmp_path)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-        package = make_deb.make(wheel, libraries, tmp_path / "out")[0]
+def test_bill_of_materials_is_beside_the_package_too(built: Built) -> None:
+    package = built.packages[0]
     beside = package.with_suffix(".cdx.json").read_text()
     assert json.loads(beside) == bill_of(package.read_bytes())
 
@@ -434,54 +446,45 @@ time.time = lambda: _time() + 40 * 86400
 """
 
 
-def test_two_builds_in_different_surroundings_are_equal(tmp_path: Path) -> None:
+def test_two_builds_in_different_surroundings_are_equal(built: Built, tmp_path: Path) -> None:
     """They differ in folder, time, time zone, language, hash seed, umask and order of files."""
-    wheel, libraries = inputs(tmp_path)
     script = (
-        "import os, sys; os.umask(int(sys.argv[1], 8)); sys.path.insert(0, sys.argv[2]); "
+        "import os, sys; os.umask(0o077); sys.path.insert(0, sys.argv[1]); "
         "from pathlib import Path; import make_deb; "
-        "make_deb.make(Path(sys.argv[3]), [Path(p) for p in sys.argv[5:]], Path(sys.argv[4]))"
+        "make_deb.make(Path(sys.argv[2]), [Path(p) for p in sys.argv[4:]], Path(sys.argv[3]))"
     )
     later = tmp_path / "later"
     later.mkdir()
     (later / "sitecustomize.py").write_text(ANOTHER_TIME)
-    built = []
-    for number, (umask, environment) in enumerate(
-        (
-            ("022", {"TZ": "UTC", "LC_ALL": "C", "LANG": "C"}),
-            (
-                "077",
-                {
-                    "TZ": "Pacific/Kiritimati",
-                    "LC_ALL": "tr_TR.UTF-8",
-                    "LANG": "de_DE.UTF-8",
-                    "LANGUAGE": "de:fr",
-                    "COLUMNS": "200",
-                    "PYTHONHASHSEED": "77",
-                    "PYTHONPATH": str(later),
-                    "DPKG_DEB_THREADS_MAX": "3",
-                },
-            ),
-        )
-    ):
-        project = tmp_path / ("a" if number else "a/long folder with blanks/and ümlauts")
-        for name in ("deb", "kontronik_can_gw", "dbc", "eds", "CHANGELOG.md", "LICENSE"):
-            source = PROJECT / name
-            copy = shutil.copytree if source.is_dir() else shutil.copyfile
-            (project / name).parent.mkdir(parents=True, exist_ok=True)
-            copy(source, project / name)
-        out = tmp_path / f"out{number}"
-        words = [umask, str(project / "deb"), str(wheel), str(out)]
-        words += map(str, reversed(libraries) if number else libraries)
-        paths = [environment.pop("PYTHONPATH", ""), str(project)]
-        environment |= {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-        subprocess.run(
-            [sys.executable, "-c", script, *words],
-            env=os.environ | environment | {"SOURCE_DATE_EPOCH": "1700000000"},
-            check=True,
-        )
-        built.append({path.name: path.read_bytes() for path in out.iterdir()})
-    assert len(built[0]) == 6
-    assert built[0].keys() == built[1].keys()
-    for name, content in built[0].items():
-        assert content == built[1][name], name
+    project = tmp_path / "a" / "long folder with blanks" / "and ümlauts"
+    project.mkdir(parents=True)
+    for name in ("deb", "kontronik_can_gw", "dbc", "eds", "CHANGELOG.md", "LICENSE"):
+        source = PROJECT / name
+        copy = shutil.copytree if source.is_dir() else shutil.copyfile
+        copy(source, project / name)
+    out = tmp_path / "out"
+    environment = {
+        "TZ": "Pacific/Kiritimati",
+        "LC_ALL": "tr_TR.UTF-8",
+        "LANG": "de_DE.UTF-8",
+        "LANGUAGE": "de:fr",
+        "COLUMNS": "200",
+        "PYTHONHASHSEED": "77",
+        "PYTHONPATH": f"{later}{os.pathsep}{project}",
+        "DPKG_DEB_THREADS_MAX": "3",
+        "SOURCE_DATE_EPOCH": EPOCH,
+    }
+    words = [project / "deb", built.wheel, out, *reversed(built.libraries)]
+    subprocess.run(
+        [sys.executable, "-c", script, *map(str, words)],
+        env=os.environ | environment,
+        check=True,
+    )
+    first, second = (
+        {path.name: path.read_bytes() for path in folder.iterdir()}
+        for folder in (built.packages[0].parent, out)
+    )
+    assert len(first) == 6
+    assert first.keys() == second.keys()
+    for name, content in first.items():
+        assert content == second[name], name

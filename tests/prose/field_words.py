@@ -135,9 +135,9 @@ def _prose(text: str, suffix: str) -> Iterator[tuple[int, str]]:
 
 def _messages(source: str) -> Iterator[tuple[int, str]]:
     """Yield the texts of several words in a Python file, except docstrings."""
-    tree = ast.parse(source)
-    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
+    nodes = list(ast.walk(ast.parse(source)))
+    docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
         match node:
             case ast.Constant(value=str(text)) if id(node) not in docstrings:
                 words = text.split()
