@@ -82,7 +82,8 @@ def test_fields_are_in_wire_order_and_have_their_types(
     data: DataType,
 ) -> None:
     fields_of_frame = rows(LiveData) if data is LiveData else extremes()
-    assert max(sub for at, sub in entries if at == index) == len(fields_of_frame)
+    objects = max(sub for at, sub in entries if at == index)
+    assert objects == len(fields_of_frame), f"add the field to eds/{SHIPPED.name}, {index:X}h"
     for sub, (name, row) in enumerate(fields_of_frame.items(), 1):
         entry = entries[index, sub]
         expected = title(name).replace("Max ", "Maximum ").replace("Min ", "Minimum ")
@@ -93,6 +94,7 @@ def test_fields_are_in_wire_order_and_have_their_types(
         assert entry.low is None
         assert entry.high is None
         assert entry.default == 0
+        assert (index, sub) in BINDINGS, f"add {name} to canopen/objects.tsv"
         shown = BINDINGS[index, sub]
         assert shown.source.name.removesuffix("_raw") == name
         assert shown.steps == row.per_unit, name
@@ -102,6 +104,7 @@ def test_unit_codes_agree_with_the_table_of_fields(
     entries: dict[tuple[int, int], EdsEntry],
 ) -> None:
     for sub, (name, row) in enumerate(rows(LiveData).items(), 1):
+        assert (0x2002, sub) in entries, f"add the unit of {name} to eds/{SHIPPED.name}, 2002h"
         entry = entries[0x2002, sub]
         assert entry.access == "const"
         assert entry.data_type == U32

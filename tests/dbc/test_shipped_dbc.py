@@ -116,7 +116,9 @@ FIELDS = [
 @pytest.mark.parametrize("field", FIELDS, ids=lambda field: field.name)
 def test_signal_holds_every_step_of_its_field_in_the_sheet(field: specification.Field) -> None:
     name = pascal(field.name) + ("Percent" if field.unit == "%" else "")
-    found = next(signal for signal in signals_of(SHIPPED) if signal.name == name)
+    signals = {signal.name: signal for signal in signals_of(SHIPPED)}
+    assert name in signals, f"add a signal to dbc/{SHIPPED.name}"
+    found = signals[name]
     step = Decimal(1) / field.steps
     assert (found.unit or "") == field.unit.replace("µ", "u").replace("°", "deg")
     assert exact(found.scale, found.offset) == [step, Decimal(0)]

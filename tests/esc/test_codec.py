@@ -130,8 +130,9 @@ def test_field_has_type_unit_step_and_absence_of_the_sheet() -> None:
         (LiveData, specification.LIVE_FIELDS),
         (InfoData, specification.INFO_FIELDS),
     ):
+        names = [field.name for field in fields]
+        assert [*rows(data)] == names, "add the field to tests/specification"
         for (name, row), field in zip(rows(data).items(), fields, strict=True):
-            assert name == field.name
             assert row.wire == field.code
             assert row.unit == field.unit
             assert row.per_unit == field.steps

@@ -159,7 +159,7 @@ def check_replay(setup: CaptureSetup, seed: int) -> None:
     assert bench.quiet_turns > 50 or not setup.core_numbers["quiet_after_ns"]
     frames = [frame for frame in replayed(bench) if not frame.received]
     assert frames == bench.sent
-    assert len(frames) > 10
+    assert len(frames) > 10, "the output sends nothing"
 
 
 def test_quiet_mode_sends_nothing_and_has_no_deadline(name: str) -> None:
@@ -169,7 +169,7 @@ def test_quiet_mode_sends_nothing_and_has_no_deadline(name: str) -> None:
     bench.run(3)
     assert bench.gateway.status.is_quiet
     assert bench.run(20) == [], "info data and emergencies have their own timeouts"
-    assert bench.gateway.next_deadline() == NEVER
+    assert bench.gateway.next_deadline() == NEVER, "next_deadline of the output in quiet mode"
 
 
 def test_nothing_is_sent_while_frames_are_held_and_all_after_it(name: str) -> None:
@@ -178,7 +178,8 @@ def test_nothing_is_sent_while_frames_are_held_and_all_after_it(name: str) -> No
     bench.gateway.hold(bench.now)
     assert bench.run(2) == []
     bench.gateway.release(bench.now)
-    assert {frame.can_id for frame in bench.run(2)} >= before
+    after = {frame.can_id for frame in bench.run(2)}
+    assert after >= before, "end in can_returned what hold begins"
 
 
 def test_first_frame_after_an_outage_has_no_measurement(name: str) -> None:
@@ -191,8 +192,8 @@ def test_first_frame_after_an_outage_has_no_measurement(name: str) -> None:
         bench.gateway.hold(bench.now)
         bench.run(1)
         first.append(bench.gateway.first_frame(bench.now))
-    assert first[0] is not None
-    assert first[0] == first[1]
+    assert first[0] is not None, "return a frame from first_frame of the output"
+    assert first[0] == first[1], "first_frame of the output has a measurement"
     assert others[0] != others[1]
 
 
@@ -202,8 +203,8 @@ def test_own_ids_cover_each_frame_that_is_sent(name: str) -> None:
     (output,) = bench.gateway.outputs
     frames = [sent.frame for sent in bench.sent]
     assert len(frames) > 10
-    assert list(foreign_ids(frames, output.own_ids())) == []
-    assert list(foreign_ids(frames, setup_alone(name).taken_ids())) == []
+    assert list(foreign_ids(frames, output.own_ids())) == [], "add to own_ids of the output"
+    assert list(foreign_ids(frames, setup_alone(name).taken_ids())) == [], "add to taken_ids"
 
 
 def test_traffic_is_close_to_its_estimate(name: str) -> None:
@@ -211,8 +212,9 @@ def test_traffic_is_close_to_its_estimate(name: str) -> None:
     bench.run(2)
     frames = bench.run(20)
     frames_per_s, bits_per_s = setup_alone(name).traffic()
-    assert len(frames) / 20 == pytest.approx(frames_per_s, rel=0.1)
-    assert sum(map(bits, frames)) / 20 == pytest.approx(bits_per_s, rel=0.1)
+    assert len(frames) / 20 == pytest.approx(frames_per_s, rel=0.1), "traffic of the setup"
+    sent_bits_per_s = sum(map(bits, frames)) / 20
+    assert sent_bits_per_s == pytest.approx(bits_per_s, rel=0.1), "traffic of the setup"
     worst = setup_alone(name).traffic(is_worst=True)
     assert worst[0] >= frames_per_s
     assert worst[1] >= bits_per_s
