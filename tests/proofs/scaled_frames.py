@@ -6,6 +6,8 @@ parameters: the one in C from wire.h, the one in Python from names of its module
 
 from dataclasses import dataclass
 
+from specification import INFO_FIELDS, LIVE_FIELDS
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -36,6 +38,9 @@ class Scale:
         ]
         body = self.lengths[0][0] - len(self.prefix) - 2
         longest = self.lengths[1][1]
+        names = [f"LIVE_{field.name}" for field in LIVE_FIELDS]
+        names += [f"INFO_{field.name}" for field in INFO_FIELDS]
+        fields = "\n".join(f"#define KCG_{name.upper()}(body) (body)[0]" for name in names)
         return f"""\
 #ifndef KCG_WIRE_H
 #define KCG_WIRE_H
@@ -53,13 +58,7 @@ enum {{ KCG_PREFIX_SIZE = {len(self.prefix)}, KCG_CRC_SIZE = 1 }};
 #define KCG_CRC(crc, bytes, size) scaled_crc(crc, bytes, size)
 #define KCG_READ_CRC(bytes) index_of(bytes)
 #define KCG_FRAME_FORMS {{{{{", ".join(forms[0])}}}, {{{", ".join(forms[1])}}}}}
-#define KCG_LIVE_ELECTRICAL_SPEED(live) (live)[0]
-#define KCG_LIVE_BATTERY_VOLTAGE(live) (live)[0]
-#define KCG_LIVE_BATTERY_CURRENT(live) (live)[0]
-#define KCG_LIVE_OPERATING_ERRORS(live) (live)[0]
-#define KCG_LIVE_OPERATING_STATE(live) (live)[0]
-#define KCG_INFO_DEVICE_AND_VARIANT(info) (info)[0]
-#define KCG_INFO_CELL_COUNT(info) (info)[0]
+{fields}
 #endif
 """
 

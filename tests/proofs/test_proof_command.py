@@ -16,6 +16,8 @@ from prove_dbc import main
 from specification.quantities import QUANTITIES, Divisor
 
 from kontronik_can_gw.esc.values import VALUES
+from kontronik_can_gw.native.rows import Signal
+from kontronik_can_gw.native.tables import SOURCES
 from kontronik_can_gw.signals.plan import MessageLayout
 
 pytestmark = pytest.mark.promise("proven-dbc")
@@ -197,3 +199,12 @@ def test_without_a_dbc_output_there_is_nothing_to_prove(tmp_path: Path, prove: P
 def test_each_value_is_in_the_sheet_of_the_proof() -> None:
     missing = VALUES.keys() ^ QUANTITIES.keys()
     assert not missing, "add them to tests/specification/quantities.py, or to esc/values.py"
+
+
+def test_proof_reads_each_source_of_c_as_the_sheet_says() -> None:
+    for (_, name), (kind, place) in SOURCES.items():
+        if name in QUANTITIES:  # the others are shown by objects only
+            quantity = QUANTITIES[name]
+            found = planned.c_source(Signal(kind=kind, place=place))
+            expected = (quantity.read, quantity.presence)
+            assert found == expected, f"tests/proofs/dbc_proof/planned.py, c_source: {name}"

@@ -417,7 +417,7 @@ def _within_word(piece: Any) -> Piece:
     return Piece(piece.shift, min(piece.width, 64 - piece.at % 64), piece.at)
 
 
-def _c_source(row: Any) -> tuple[Read, Presence]:
+def c_source(row: Any) -> tuple[Read, Presence]:
     """Return the source of a row of kcg_signal (twin: core.c, steps)."""
     kind = row.kind
     field_kinds = {
@@ -442,7 +442,7 @@ def _c_source(row: Any) -> tuple[Read, Presence]:
 
 def _c_plan(index: int, tables: Tables) -> Planned:
     row = tables.signals[index]
-    read, presence = _c_source(row)
+    read, presence = c_source(row)
     flags = row.flags
     numbers: dict[int, int] | None = None
     if flags & KCG.TABLE:
