@@ -8,7 +8,7 @@ help:
 	@echo 'make test      ruff, mypy, tests, and the most important tests on a real vcan'
 	@echo '               (ARGS="--only lint|types|unit|vcan -- -k crc")'
 	@echo 'make test-all  the slower tests: faults, systemd, browser, MQTT broker, CANopen masters'
-	@echo '               of other projects   (ARGS="--only faults|tools|masters|prove|cuts")'
+	@echo '               of other projects   (ARGS="--only faults|tools|slow|masters|prove|cuts")'
 	@echo 'make prove     the proofs of docs/proof.md that end within 5 min; a part of make test-all'
 	@echo '               (your DBC: ARGS="-c /PATH/gateway.toml", see docs/your-own-dbc.md)'
 	@echo 'make release   tests that take hours, on a quiet machine: faults on emulated hardware,'

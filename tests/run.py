@@ -15,7 +15,8 @@ test-all, the slow checks and the checks with other programs:
             It repeats the tests marked "rights": CI runs `test` as an ordinary user and
             `test-all` as root.
   masters   tests marked "extended" on a vcan, with CANopen masters of other projects
-  gate      all states of the gate, and pairs of rows of its table in both cores and a replay
+  slow      tests marked "extended" that need only the processor: all states of the gate, a
+            million frames in both cores, fuzzers, DBCs of real cars, a hostile bus ...
   prove     the proofs of docs/proof.md that end within five minutes
   cuts      200 states after a power loss, in User Mode Linux
 
@@ -85,9 +86,11 @@ ON_VCAN = (
 )
 ELSEWHERE = "--ignore=tests/vcan --ignore=tests/proofs"
 """Folders with steps of their own."""
-GATE = "tests/gateway/test_gate.py tests/runtime/test_gate_rows.py"
-"""Its extended tests need only processor time, so that their step fills the shorter lane."""
-WITHOUT_GATE = " ".join(f"--ignore={file}" for file in GATE.split())
+SLOW = (
+    "tests/gateway tests/runtime/test_gate_rows.py tests/native tests/dbc tests/dronecan tests/hour"
+)
+"""Places whose extended tests hardly wait. The longest tests are first."""
+NOT_SLOW = " ".join(f"--ignore={place}" for place in SLOW.split())
 FUZZ_OPTIONS = f"-s {LIMIT_AS_STEP}"
 PROOF = (
     "python -m pytest -q -s --junitxml={{report}} "
@@ -106,9 +109,9 @@ STEPS = {
     "unit": f"{PYTEST} {SIDE_BY_SIDE} -m 'not extended' {ELSEWHERE} {{args}}",
     "vcan": f"{ON_VCAN} -m 'not extended' {{args}}",
     "faults": FAULTS.format("uml"),
-    "tools": f"{PYTEST} {LIMIT_OF_TOOLS} -m 'extended or rights' {ELSEWHERE} {WITHOUT_GATE} "
-    "{args}",
-    "gate": f"{PYTEST} {LIMIT_OF_TOOLS} -m extended {GATE} {{args}}",
+    "tools": f"{PYTEST} {LIMIT_OF_TOOLS} -m 'extended or rights' {ELSEWHERE} {NOT_SLOW} {{args}}",
+    "slow": f"{PYTEST} -n 2 --dist worksteal {LIMIT_OF_TOOLS} "
+    f"-m 'extended or rights' {SLOW} {{args}}",
     "masters": f"{ON_VCAN} -m extended {{args}}",
     "prove": f"{PYTEST} -n 2 --dist worksteal tests/proofs {{args}}",
     "cuts": PLUG.format(200),
@@ -130,7 +133,7 @@ STEPS = {
 }
 TIERS = {
     "test": (("lint", "types", "unit"), ("vcan",)),
-    "test-all": (("masters", "faults", "cuts", "gate"), ("tools", "prove")),
+    "test-all": (("masters", "faults", "cuts"), ("tools",), ("slow", "prove")),
     "prove": (("prove",),),
     "release": (
         (

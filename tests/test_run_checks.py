@@ -151,7 +151,16 @@ def test_every_step_is_in_one_tier_and_every_marker_is_run() -> None:
             if place in step and found:
                 chosen.append(found[1])
         assert sorted(chosen) == ["extended", "not extended"]
-    assert "-m 'extended or rights'" in checks.STEPS["tools"], "CI runs this one as root"
+
+
+def test_tools_and_slow_run_each_place_once() -> None:
+    left_out = set(re.findall(r"--ignore=(\S+)", checks.STEPS["tools"]))
+    elsewhere = set(re.findall(r"--ignore=(\S+)", checks.STEPS["unit"]))
+    places = set(re.findall(r" (tests/\S+)", checks.STEPS["slow"]))
+    assert left_out - elsewhere == places
+    assert all((checks.PROJECT / place).exists() for place in places)
+    for step in ("tools", "slow"):
+        assert "-m 'extended or rights'" in checks.STEPS[step], "CI runs this one as root"
 
 
 def test_step_may_take_as_long_as_the_page_about_proofs_says() -> None:
