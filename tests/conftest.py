@@ -97,7 +97,8 @@ def core_language(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     library.cache_clear()
     found, why = library()
     if found is None and language == "C":
-        pytest.skip(f"the core in C: {why}; sudo apt-get install gcc libc6-dev, and install again")
+        remedy = "sudo apt-get install gcc libc6-dev; python -m kontronik_can_gw.native.compile"
+        pytest.skip(f"the core in C: {why}; {remedy}")
     yield language
     library.cache_clear()
 

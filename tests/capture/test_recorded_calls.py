@@ -70,7 +70,7 @@ def test_new_call_that_is_missing_in_the_table_is_named() -> None:
 
 def test_every_kind_of_entry_is_a_call_or_a_note() -> None:
     assert len(CALL_OF) == len(CALLS)
-    assert {*CALL_OF} | NOTES == {*EntryKind}
+    assert {*CALL_OF} | NOTES == {*EntryKind}, "Add a row to CALLS in capture/calls.py"
     assert not {*CALL_OF} & NOTES
 
 
@@ -78,7 +78,10 @@ def test_every_kind_of_entry_is_a_call_or_a_note() -> None:
 def test_arguments_of_a_call_are_the_same_after_recording(
     method: str, calls: list[RecordedCall]
 ) -> None:
+    parameters = [*inspect.signature(getattr(Gateway, method)).parameters.values()][1:]
+    needed = [each.name for each in parameters if each.default is each.empty]
     for given in EXAMPLES.get(method, [(20,)]):
+        assert len(given) >= len(needed), f"Add {method}({', '.join(needed)}) to EXAMPLES"
         (entry,) = [
             Entry(recorded.now, call.kind, *recorded[1:])
             for call in calls

@@ -8,6 +8,7 @@ import math
 import re
 import tomllib
 from copy import deepcopy
+from dataclasses import MISSING, fields
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,19 @@ from kontronik_can_gw.config.conditions import condition
 from kontronik_can_gw.config.export import as_toml
 from kontronik_can_gw.config.keys import REMOVED_KEYS, Config, shipped
 from kontronik_can_gw.config.parse import load, parse
+from kontronik_can_gw.core.settings import NUMBERS, CoreSettings
 from kontronik_can_gw.errors import UserError, did_you_mean
+from kontronik_can_gw.native.header import structure
+from kontronik_can_gw.signals.plan import MessageLayout
 from kontronik_can_gw.times import MS
 
 pytestmark = pytest.mark.promise("all-mistakes")
 
 EXAMPLE = Path(kontronik_can_gw.__file__).parent / "example.toml"
+KCG_PLAN = structure("kcg_plan")
+DEFAULT_SETTINGS = {
+    each.name: each.default for each in fields(CoreSettings) if each.default is not MISSING
+}
 KEYS: dict[str, dict[str, Any]] = {}
 for _table, _described in schema()["properties"].items():
     _entries = _described.get("items", _described)["properties"]
@@ -302,6 +310,28 @@ def test_shipped_example_is_valid_and_has_every_key(tmp_path: Path) -> None:
         given[table] = {key for entry in entries for key in entry}
     known = {table: set(keys) for table, keys in KEYS.items()}
     assert given == known, f"add the keys to {EXAMPLE.name}"
+
+
+# --- settings of the core
+
+
+def test_each_setting_of_the_core_follows_from_the_configuration() -> None:
+    made = tomllib.loads(uncommented())
+    made["dbc"]["on_loss"] = "silent"  # the only value of the example that is the default
+    config = parse(made, str(EXAMPLE))
+    settings = config.core_settings((), MessageLayout("", "", ()))
+    for name, default in DEFAULT_SETTINGS.items():
+        if name != "slots":  # follows from the outputs
+            message = f"set {name} in config/keys.py: Config.core_settings"
+            assert getattr(settings, name) != default, message
+
+
+def test_each_setting_that_is_a_number_reaches_the_core_in_c() -> None:
+    numbers = {name for name, default in DEFAULT_SETTINGS.items() if type(default) is int}
+    missing = numbers - {"slots"} - NUMBERS.keys()
+    assert not missing, "add it to NUMBERS in core/settings.py"
+    for name in NUMBERS:
+        assert hasattr(KCG_PLAN, name), f"add {name} to kcg_plan in native/core.h"
 
 
 # --- schema and parser compared

@@ -132,6 +132,7 @@ def _steps(
     if name in _OF_COUNTERS:
         return int(getattr(esc.counters, _OF_COUNTERS[name]))
     if not read.wire and read != PRODUCT:
+        assert hasattr(esc, name), f"add {name} to _STEPS in {__file__}"
         return int(getattr(esc, name))
     data = esc.info if read.source == "info" else esc.live
     if data is None:
