@@ -26,7 +26,7 @@ from kontronik_can_gw.cli.arguments import Parser, add_options, refuse_removed_o
 from kontronik_can_gw.errors import RunError, UserError
 from kontronik_can_gw.printable import printable
 
-_CLOSED_OUTPUT = 128 + signal.SIGPIPE
+CLOSED_OUTPUT = 128 + signal.SIGPIPE
 """Exit code if the reader of the output has closed it.
 
 A shell shows this code for a program that SIGPIPE ended.
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _run(list(sys.argv[1:] if argv is None else argv))
     except BrokenPipeError:  # the reader of the output has ended, for example `| head`
         discard_output()
-        return _CLOSED_OUTPUT
+        return CLOSED_OUTPUT
     except KeyboardInterrupt:
         return _INTERRUPTED
 

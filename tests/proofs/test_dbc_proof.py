@@ -248,6 +248,6 @@ def test_fault_of_the_compiler_is_refuted(each: PlanFault, copy: Path, tmp_path:
         )
     finally:
         file.write_text(whole)
-    assert done.returncode == 1, done.stderr.decode()
+    assert done.returncode == prove_dbc.REFUTED, done.stderr.decode()
     refuted_lines = json.loads(done.stdout)["refuted"]
     assert any(each.refuted_as in line for line in refuted_lines), refuted_lines

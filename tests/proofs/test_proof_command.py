@@ -3,11 +3,13 @@
 import json
 import os
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import prove_dbc
 import pytest
 import z3  # type: ignore[import-untyped]
 from command_line import refused, written
@@ -112,7 +114,7 @@ def test_wrong_plan_is_refuted_in_the_words_of_the_user(
 
     monkeypatch.setattr(planned, "_python_plan", wrong)
     done = prove("-c", path)
-    assert done.code == 1
+    assert done.code == 4
     lines = [line for line in done.out.splitlines() if line.startswith("  REFUTED ")]
     assert lines[0] == (
         "  REFUTED   Motor.BatteryCurrent: battery current 3276.7 A "
@@ -132,7 +134,7 @@ def test_no_signal_of_a_message_with_a_wrong_id_is_proven(
 
     monkeypatch.setattr(proof, "of_python", wrong)
     done = prove("-c", path)
-    assert done.code == 1
+    assert done.code == 4
     assert "  proof     0 of 3 signals proven for all values and settings\n" in done.out
     assert "  REFUTED   Motor: is sent with CAN id 101h, not 100h\n" in done.out
 
@@ -147,7 +149,7 @@ def test_no_signal_of_a_message_that_is_never_sent_is_proven(
 
     monkeypatch.setattr(proof.Proof, "__init__", wrong)
     done = prove("-c", path)
-    assert done.code == 1
+    assert done.code == 4
     assert "  proof     0 of 3 signals proven for all values and settings\n" in done.out
     assert "  REFUTED   Motor: is in the DBC, but is never sent\n" in done.out
 
@@ -160,6 +162,39 @@ def test_signal_that_the_solver_gives_up_is_listed_by_name(
     done = prove("-c", path)
     assert done.code == 3
     assert "  not proven: Motor.MotorSpeed: the solver gave up: timeout\n" in done.out
+
+
+@pytest.mark.parametrize("option", ["-v", "--json"])
+@pytest.mark.parametrize(
+    ("end", "code", "message"),
+    [
+        ("| true", 141, ""),
+        (">/dev/full", 1, "make prove: standard output: No space left on device\n"),
+    ],
+)
+def test_output_that_cannot_be_written_is_no_counter_example(
+    path: Path, option: str, end: str, code: int, message: str
+) -> None:
+    command = f'{{ "{sys.executable}" "{prove_dbc.__file__}" {option} -c "{path}"; echo $? >&2; }}'
+    environment = os.environ | {"PYTHONPATH": f"{PROJECT}:{PROJECT / 'tests'}"}
+    done = subprocess.run(
+        ["sh", "-c", f"{command} {end}"], env=environment, capture_output=True, text=True
+    )
+    assert done.stderr == f"{message}{code}\n"
+
+
+def test_proof_without_z3_ends_with_the_remedy(path: Path, tmp_path: Path) -> None:
+    written(tmp_path / "z3.py", "raise ModuleNotFoundError(\"No module named 'z3'\", name='z3')")
+    done = subprocess.run(
+        [sys.executable, prove_dbc.__file__, "-c", path],
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}:{PROJECT}:{PROJECT / 'tests'}"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr == (
+        "make prove: z3: No module named 'z3'. Install it: tests/bootstrap.sh prove\n"
+    )
 
 
 def test_removed_option_prints_the_command_that_replaces_it(path: Path) -> None:
