@@ -40,8 +40,9 @@ release, by hand on a quiet machine:
 
 The lanes of a tier run side by side. A step runs once, and its output appears when it ends.
 The exit code is 0 if every step has passed. A step that cannot run is a failure, and is listed with
-the command that enables it. --without STEP leaves it out. With CI=true each skipped test is a
-failure, too. The last line has the totals: `N passed, M failed, K skipped`.
+the command that enables it. --without STEP leaves it out. A step whose tests were all skipped is a
+failure, unless PYTEST-ARGUMENTS chose them. With CI=true each skipped test is a failure. The last
+line has the totals: `N passed, M failed, K skipped`.
 """
 
 import argparse
@@ -159,6 +160,7 @@ ENABLE_FILE_SYSTEMS = f"{ENABLE_UML} e2fsprogs f2fs-tools dosfstools"
 PROVERS = "frama-c arm-none-eabi-gcc"
 WHEELS = "aarch64-linux-gnu-gcc arm-linux-gnueabihf-gcc qemu-arm"
 ENABLE_WHEELS = "gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf qemu-user"
+ENABLE_COMPILER = "sudo apt-get install gcc libc6-dev"
 NEEDS = {
     "vcan": ("ip candump vcan", ENABLE_VCAN),
     "masters": ("ip candump vcan", ENABLE_VCAN),
@@ -168,7 +170,9 @@ NEEDS = {
     "hours": ("linux.uml cc", ENABLE_UML),
     "cuts": (MAKE_FILE_SYSTEMS, ENABLE_FILE_SYSTEMS),
     "plug": (MAKE_FILE_SYSTEMS, ENABLE_FILE_SYSTEMS),
-    "proofs": ("cc", "sudo apt-get install gcc libc6-dev"),
+    "prove": ("cc", ENABLE_COMPILER),
+    "proofs": ("cc", ENABLE_COMPILER),
+    "years": ("cc", ENABLE_COMPILER),
     "eva": ("frama-c", "sudo apt-get install frama-c-base"),
     "worst": ("arm-none-eabi-gcc", "sudo apt-get install gcc-arm-none-eabi"),
     "put-in": (
@@ -299,8 +303,12 @@ def run(
         result.failed = int(bool(code))
     elif report.exists():
         read_report(report, result)
-    nothing_chosen = code == 5 and arguments
-    if not nothing_chosen and not result.failed and (code or not (result.passed or result.skipped)):
+    if result.failed or (code == 5 and arguments):  # 5: the arguments chose no test
+        return result
+    if not code and result.skipped and not result.passed and not arguments:
+        result.failed = 1
+        result.note = "every test was skipped"
+    elif code or not (result.passed or result.skipped):
         result.failed = 1
         result.note = result.note or f"ended with {code}"
     return result

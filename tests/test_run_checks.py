@@ -69,6 +69,27 @@ def test_step_is_judged_by_its_report_and_its_exit_code(
     assert (".crc: 3 is not 4" in result.failures) == ("failed" in cases)
 
 
+def test_step_whose_tests_were_all_skipped_has_failed(step: Any) -> None:
+    result = step("true", *67 * ["skipped"])
+    assert (result.passed, result.failed, len(result.skipped)) == (0, 1, 67)
+    assert (result.state, result.note) == ("FAILED", "every test was skipped")
+
+
+def test_chosen_test_may_be_skipped(step: Any) -> None:
+    assert step("true", "skipped", arguments=("-k", "crc")).state == "passed"
+
+
+@pytest.mark.parametrize("name", ["prove", "proofs", "years"])
+def test_proof_without_a_compiler_is_not_run(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(checks.STEPS, name, "true")
+    result = checks.run(name, 60, tmp_path, (), False)
+    assert (result.state, result.note) == ("not run", "there is no cc")
+    assert result.enable == "sudo apt-get install gcc libc6-dev"
+
+
 def test_step_without_tests_is_one_check_with_a_time_limit(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
