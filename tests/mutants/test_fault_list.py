@@ -1,7 +1,10 @@
 """The list of faults fits the present code, and only a failure due to a fault detects it."""
 
 import ast
+import re
 import subprocess
+import tomllib
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -121,3 +124,31 @@ def test_time_out_detects_a_fault_only_if_the_tests_are_quick(
 
     monkeypatch.setattr(subprocess, "run", wait_too_long)
     assert put_in_faults.tested(Path(), (test,), False) == code
+
+
+@pytest.mark.parametrize(
+    ("words", "test"),
+    [
+        ("of the deframer", "proofs/test_small_scope.py"),
+        ("of the packer", "proofs/test_every_value.py"),
+        ("of both cores", "proofs/test_years.py"),
+        ("of the code that writes files", "plug/power_cuts.py"),
+        ("for the proof of instructions", "proofs/long_worst_case.py"),
+        ("for the proof of no undefined behaviour", "proofs/long_eva.py"),
+    ],
+)
+def test_readme_states_the_number_of_faults(words: str, test: str) -> None:
+    files = Counter(name.partition("::")[0] for fault in faults() for name in fault.seen_by)
+    assert stated_count(words) == files[f"tests/{test}"]
+
+
+def test_readme_states_the_number_of_faults_of_the_compiler() -> None:
+    path = PROJECT / "tests/mutants/plan_faults.toml"
+    assert stated_count("of the compiler") == len(tomllib.loads(path.read_text())["fault"])
+
+
+def stated_count(words: str) -> int:
+    """Return the number of faults that the page about the proofs states."""
+    page = (PROJECT / "tests/proofs/README.md").read_text(encoding="utf-8")
+    (count,) = re.findall(rf"(\d+)\sfaults\s{words}\b", page)
+    return int(count)
