@@ -191,3 +191,12 @@ def test_step_may_take_as_long_as_the_page_about_proofs_says() -> None:
     assert dict(rows) == {"years": "9"}
     for step, hours in rows:
         assert checks.limit_s("release", step) >= 2 * 3600 * int(hours), "a slower machine, too"
+
+
+def test_slow_tests_of_the_page_about_time_exist() -> None:
+    page = (checks.PROJECT / "tests/README.md").read_text(encoding="utf-8")
+    tests = re.findall(r"^\| `(\S+)::(\w+)` \|", page, re.MULTILINE)
+    assert len(tests) == 50
+    for file, name in tests:
+        source = (checks.PROJECT / "tests" / file).read_text(encoding="utf-8")
+        assert f"\ndef {name}(" in source, f"tests/README.md: {file}::{name}"
