@@ -114,6 +114,27 @@ def test_mistake_names_section_and_key(tmp_path: Path, old: str, new: str, messa
     assert f"{path}: {message}" in refused(2, "conformance", "--eds", path)
 
 
+@pytest.mark.parametrize("number", ["-1", "0", "5", "99"])
+@pytest.mark.parametrize(
+    ("index", "name", "right"),
+    [("1017", "Producer heartbeat time", "0x7"), ("1801", "TPDO 2 communication parameter", "0x9")],
+)
+def test_wrong_object_type_is_named(
+    tmp_path: Path, index: str, name: str, right: str, number: str
+) -> None:
+    begin = f"[{index}]\r\nParameterName={name}\r\nObjectType="
+    path = eds_with(tmp_path, (begin + right, begin + number))
+    assert refused(2, "conformance", "--eds", path) == (
+        f"{path}: [{index}] ObjectType={number}: not the type of an object. "
+        "Use 0x2, 0x7, 0x8 or 0x9."
+    )
+
+
+def test_object_types_of_data_types_are_accepted(tmp_path: Path) -> None:
+    path = eds_with(tmp_path, ("[1000]", "[0020]\nParameterName=Own\nObjectType=6\n\n[1000]"))
+    assert 0x1000 in read_eds(path, 1).dictionary
+
+
 def test_vendor_id_of_your_own_passes_with_its_eds(tmp_path: Path) -> None:
     path = tmp_path / "mine.eds"
     path.write_bytes(with_vendor_id(EDS.read_bytes(), 0x319))

@@ -31,6 +31,8 @@ _FIRST_OBJECT = 0x1000
 """Lower indices are data types, which [DummyUsage] permits as entries of a mapping."""
 _VARIABLES = (2, 7)
 """ObjectType of a domain and of a variable."""
+_OBJECT_TYPES = (*_VARIABLES, 8, 9)
+"""Also an array and a record. The others of CiA 301 are types, which have lower indices."""
 
 
 class EdsFile(NamedTuple):
@@ -75,7 +77,12 @@ def _problems(sections: dict[str, Section]) -> Iterator[str]:
             yield f"[{section.name}] there is no section [{match[1].upper()}]. Add it."
         is_variable = False
         with suppress(ValueError):  # reported as a wrong number
-            is_variable = section.number("ObjectType", 7) in _VARIABLES
+            object_type = section.number("ObjectType", 7)
+            is_variable = object_type in _VARIABLES
+            is_head = match[2] is None and int(match[1], 16) >= _FIRST_OBJECT
+            if is_head and object_type not in _OBJECT_TYPES:
+                problem = "not the type of an object. Use 0x2, 0x7, 0x8 or 0x9."
+                yield f"[{section.name}] {section.quoted('ObjectType')}: {problem}"
         if (match[2] or is_variable) and not section.get("DataType"):
             yield f"[{section.name}] DataType: missing. Add it."
 
