@@ -384,3 +384,8 @@ def lss_confirms_a_node_id_but_keeps_its_own(_frame: CanFrame, proxy: Proxy) -> 
 @_request("lss-fastscan", _LSS_REQUEST, "51")
 def fastscan_is_ignored(frame: CanFrame, _proxy: Proxy) -> list[CanFrame]:
     return []
+
+
+@_response("lss-store", _LSS_RESPONSE, "17")
+def lss_store_fails(frame: CanFrame, _proxy: Proxy) -> list[CanFrame]:
+    return _with(frame, 1, "02")

@@ -244,8 +244,12 @@ def _give_back_node_id(slave: Slave) -> None:
 
 
 def lss_store(slave: Slave) -> str:
+    """Require that the slave confirms the service.
+
+    A reset does not show whether a node-ID is stored, because the slave may keep it in its RAM.
+    """
     _switch(slave, _CONFIGURATION)
     answer = _ask(slave, _STORE)
     _switch(slave, _WAITING)
     require(answer[0] == _STORE and answer[1] in (0, 1), answer.hex(" ").upper())
-    return f"error code {answer[1]}"
+    return "cannot store (error code 1)" if answer[1] else "confirmed (error code 0)"
