@@ -3,7 +3,7 @@
 Each method for an event takes it over and appends to ``acts`` the work for the owner, which it
 must do in this order. Between two events these questions are answered:
 
-1. ``is_open``: may answers be handed over? ``room``: how many frames, measurements included?
+1. ``room``: how many frames may be handed over?
 2. ``wants_first_frame``: must a frame without measurements be handed over now?
 3. ``look_due``: when must the interface's count be passed to ``look``?
 4. ``due``: when must ``advance`` be called? Earlier calls do no harm. A later call acts late.
@@ -87,19 +87,23 @@ class Gate(GateState):
             self.outage_since = now
             self._step(Event.BUS_OFF, now)
 
-    def left_bus_off(self, is_running: bool, is_reported: bool, now: int) -> bool:
+    def left_bus_off(self, count: int, is_running: bool, is_reported: bool, now: int) -> bool:
         """Follow a controller that reports the end of a bus-off. Returns True if it can be used.
 
-        ``is_running``: its queue runs. ``is_reported``: its driver still reports bus-off.
+        ``count``: its sent frames, or UNCOUNTED. ``is_running``: its queue runs. ``is_reported``:
+        its driver still reports bus-off.
         """
         if not self.is_off:
             return True
+        self.under_way.count = count
         if not is_running:
             self._step(Event.STOPPED, now)
         elif is_reported:
             self._step(Event.RUNS, now)
         else:
             self._step(Event.READY, now)
+        if not self.is_off:
+            self.outage_since = now
         return not self.is_off
 
     # --- events of frames
@@ -111,7 +115,7 @@ class Gate(GateState):
         under_way = self.under_way
         if not under_way.frames:
             self.still_since = now
-            self.look_due = min(self.look_due, now + self.period_ns)
+            self.next_look = min(self.next_look, now + self.period_ns)
         under_way.add(frames, now)
         if self.state is not State.OPEN:
             self._step(Event.ACCEPTED, now)
@@ -152,6 +156,8 @@ class Gate(GateState):
         """Take the count of sent frames, or UNCOUNTED, and own frames in the kernel's queue."""
         under_way = self.under_way
         was_late = self.is_late(now)
+        if was_late:
+            self.limit.late = now
         has_moved = under_way.look(count, queued, now)
         self.queued = queued
         if has_moved:
@@ -160,18 +166,20 @@ class Gate(GateState):
                 self.retry_due = NEVER
             elif was_late and self.state is State.SLOW:
                 self.limit.is_long = True
+            elif self.first.moves_since != NEVER:
+                self.limit.is_long |= now - self.first.moves_since > self.quarter_ns
             if self.first.at != NEVER:
                 self.first.moves_since = min(self.first.moves_since, now)
             if self.state in HELD:
                 self.outage_since = now
         self._step(Event.MOVED if has_moved else Event.STILL, now)
-        self.look_due = self._next_look(now)
+        self.next_look = self._next_look(now)
 
     def adopt(self, departures: Any, now: int) -> None:
         """Take over the frames of iterations in C (``kcg_departures`` of native/linux.h)."""
         self.under_way.adopt(departures, now)
         self.still_since = departures.still_since
-        self.look_due = departures.check_due
+        self.next_look = departures.check_due
 
     def request(self, now: int) -> None:
         """Note that outputs have made answers while frames are held."""
@@ -237,7 +245,7 @@ class Gate(GateState):
             self.runs_since = now
         if state is State.BLOCKED or state is State.QUIET_BLOCKED:
             self.is_off = False
-        self.look_due = self._next_look(now)
+        self.next_look = self._next_look(now)
 
     def _next_look(self, now: int) -> int:
         """Return the time of the next look."""

@@ -54,12 +54,12 @@ def _limit(gate: GateState, now: int) -> None:
 def _halve(gate: GateState, now: int) -> None:
     gate.limit.frames = max(1, gate.limit.frames // 2)
     gate.limit.late = now
-    gate.limit.quarter_due = now + gate.quarter_ns
+    gate.limit.changed = now
 
 
 def _grow(gate: GateState, now: int) -> None:
     gate.limit.frames += 1
-    gate.limit.quarter_due = now + gate.quarter_ns
+    gate.limit.changed = now
 
 
 def _ask(gate: GateState, now: int) -> None:
@@ -114,8 +114,13 @@ def _is_opened_without_first(gate: GateState, now: int) -> bool:
     return not gate.queued and now - gate.outage_since >= NO_FIRST_NS
 
 
-def _is_quarter_over(gate: GateState, now: int) -> bool:
-    return now >= gate.limit.quarter_due
+def _is_limit_old(gate: GateState, now: int) -> bool:
+    return now >= gate.limit_due
+
+
+def _is_limit_too_high(gate: GateState, now: int) -> bool:
+    was_late = gate.is_late(now) or gate.limit.late > gate.limit.changed
+    return was_late and _is_limit_old(gate, now)
 
 
 def _is_refused_long(gate: GateState, now: int) -> bool:
@@ -150,7 +155,9 @@ def _is_first_lost(gate: GateState, now: int) -> bool:
 
 
 def _may_ask_now(gate: GateState, now: int) -> bool:
-    return gate.may_ask and now >= gate.restart_due
+    if not gate.may_ask or now < gate.restart_due:
+        return False
+    return gate.is_off or gate.under_way.looked >= gate.restart_due
 
 
 def _is_unanswered(gate: GateState, now: int) -> bool:
@@ -178,11 +185,11 @@ TESTS: Mapping[If, Callable[[GateState, int], bool]] = {
     If.REFUSED_LONG: _is_refused_long,
     If.BLOCKED: _is_blocked,
     If.LATE: GateState.is_late,
-    If.QUARTER_LATE: lambda gate, now: _is_quarter_over(gate, now) and gate.is_late(now),
+    If.HALF_LATE: _is_limit_too_high,
     If.FULL_SPEED: lambda gate, now: (
-        _is_quarter_over(gate, now) and gate.limit.frames + 1 >= UNLIMITED
+        _is_limit_old(gate, now) and gate.limit.frames + 1 >= UNLIMITED
     ),
-    If.QUARTER: _is_quarter_over,
+    If.HALF: _is_limit_old,
     If.LATE_LONG: lambda gate, _now: (
         not gate.is_slow and gate.limit.late - gate.limit.since >= LASTING_NS
     ),

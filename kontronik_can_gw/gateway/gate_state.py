@@ -21,14 +21,17 @@ class Limit:
     """The limit of frames under way on a slow bus."""
 
     frames: int = UNLIMITED
-    quarter_due: int = NEVER
-    """End of the quarter after which the limit changes."""
+    changed: int = NEVER
+    """Time of its last change."""
     since: int = 0
     """Time at which the bus became slow."""
     late: int = 0
     """The last time at which a frame was under way for more than a quarter."""
     is_long: bool = False
-    """True if a frame has left late since the bus became slow, so it is not just blocked."""
+    """True if a frame has left late since the bus became slow, so it is not just blocked.
+
+    Or the first frame has left late after another one.
+    """
 
 
 @dataclass
@@ -102,8 +105,8 @@ class GateState:
         """Time since which a controller runs although its driver reports bus-off."""
         self.retry_due = NEVER
         """Time of the next attempt after a refusal. NEVER if the last frame was accepted."""
-        self.look_due = NEVER
-        """Time of the next look at the interface's count."""
+        self.next_look = NEVER
+        """Time of the next usual look at the interface's count (``look_due``)."""
         self.limit = Limit()
         self.first = FirstFrame()
         self.restart = Restarts(restart_after_ns, restart_after_ns)
@@ -112,6 +115,15 @@ class GateState:
     def quarter_ns(self) -> int:
         """A quarter of the shortest telemetry timeout."""
         return self.timeout_ns // 4
+
+    @property
+    def limit_due(self) -> int:
+        """Time at which the limit of a slow bus changes.
+
+        A frame that was accepted in the first quarter after a change is late in the second one, if
+        the limit is too high.
+        """
+        return self.limit.changed + 2 * self.quarter_ns
 
     @property
     def may_ask(self) -> bool:
@@ -128,6 +140,13 @@ class GateState:
     def restart_due(self) -> int:
         """Time at which a restart is requested."""
         return max(self.outage_since, self.restart.asked) + self.restart.pause_ns
+
+    @property
+    def look_due(self) -> int:
+        """Time of the next look at the interface's count. A restart is requested after a look."""
+        if self.may_ask and self.under_way.looked < self.restart_due and not self.is_off:
+            return min(self.next_look, self.restart_due)
+        return self.next_look
 
     def is_late(self, now: int) -> bool:
         """Return True if a frame is under way for more than a quarter."""
@@ -176,7 +195,7 @@ class GateState:
         if state in NO_PORT and state is not State.BUS_OFF:
             return NEVER
         if state is State.SLOW:
-            return min(self.look_due, self.limit.quarter_due)
+            return min(self.look_due, self.limit_due)
         due = min(self.retry_due, self.look_due)
         if state in WAITING:
             due = min(due, self.discarded + LASTING_NS)

@@ -82,9 +82,9 @@ class If(Enum):
     REFUSED_LONG = "refused for 1 s"
     BLOCKED = "none has left for too long"
     LATE = "a frame is late"
-    QUARTER_LATE = "quarter over, a frame is late"
-    FULL_SPEED = "quarter over, the limit is 31"
-    QUARTER = "quarter over"
+    HALF_LATE = "half over, a frame was late"
+    FULL_SPEED = "half over, the limit is 31"
+    HALF = "half over"
     LATE_LONG = "late frames for 1 s, not reported"
     UNCOUNTED = "the driver does not count"
     NO_FIRST_OPENS = "no frame is under way, or none has left for 10 s"
@@ -180,9 +180,9 @@ TABLE = (
     Row((_S.OPEN,), _E.STILL, If.LATE, _S.SLOW, (Act.LIMIT,)),
     Row((_S.OPEN,), _E.MOVED, If.LATE, _S.SLOW, (Act.LIMIT,)),
     Row((_S.SLOW,), _E.STILL, If.BLOCKED, _S.BLOCKED, (Act.HOLD,)),
-    Row((_S.SLOW,), _E.TIME, If.QUARTER_LATE, None, (Act.HALVE,)),
+    Row((_S.SLOW,), _E.TIME, If.HALF_LATE, None, (Act.HALVE,)),
     Row((_S.SLOW,), _E.TIME, If.FULL_SPEED, _S.OPEN, (Act.UNLIMIT,)),
-    Row((_S.SLOW,), _E.TIME, If.QUARTER, None, (Act.GROW,)),
+    Row((_S.SLOW,), _E.TIME, If.HALF, None, (Act.GROW,)),
     Row((_S.SLOW,), _E.TIME, If.LATE_LONG, None, (Act.SLOW,)),
     # the first frame after an outage
     Row((_S.BLOCKED,), _E.FIRST_ACCEPTED, If.UNCOUNTED, _S.OPEN, (Act.RELEASE, Act.PROVE)),

@@ -95,7 +95,7 @@ def limits(gate: Gate) -> dict[str, int]:
         if restart.asked != -NEVER:
             found["worked"] = restart.works_since + WORKED_NS
     if state is State.SLOW:
-        found["quarter"] = gate.limit.quarter_due
+        found["half"] = gate.limit_due
         if gate.limit.is_long:
             found["blocked"] = gate.still_since + LASTING_NS
     if state is State.BLOCKED:
@@ -139,12 +139,13 @@ def key_of(gate: Gate, now: int) -> Key:
     has_count = gate.under_way.count != UNCOUNTED
     key += [gate.is_socket, gate.is_off, gate.is_off and gate.stays_off, has_count]
     key += [gate.is_slow, gate.limit.is_long]
+    key.append(gate.may_ask and gate.under_way.looked >= gate.restart_due)
     if state not in (State.BUS_OFF, State.SETTLING):
         key.append(min(gate.under_way.frames, 2))
     if state is State.SLOW:
         limit = gate.limit
         key.append(limit.frames if limit.frames in (1, 2, UNLIMITED - 1, UNLIMITED) else 3)
-        key.append(limit.late - limit.since >= LASTING_NS)
+        key += [limit.late - limit.since >= LASTING_NS, limit.late > limit.changed]
     if state in (State.FIRST, State.MOVING, State.RESTARTING, State.BLOCKED):
         key += [bool(gate.queued), gate.first.is_missing, gate.first.at == NEVER]
         key.append(gate.first.moves_since == NEVER)
@@ -165,13 +166,13 @@ def _let_grow(gate: Gate, now: int) -> None:
     """Let all frames leave, and quarters pass until the limit is the highest."""
     gate.look(gate.under_way.count + max(1, gate.under_way.frames), 0, now)
     while gate.limit.frames < UNLIMITED - 1:
-        gate.limit.quarter_due = now
+        gate.limit.late = gate.limit.changed = now - TIMEOUT // 2
         gate.advance(now)
 
 
 def _leave_bus_off(is_running: bool, is_reported: bool) -> Step:
     def leave(gate: Gate, now: int) -> None:
-        gate.left_bus_off(is_running, is_reported, now)
+        gate.left_bus_off(gate.under_way.count, is_running, is_reported, now)
 
     return leave
 

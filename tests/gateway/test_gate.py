@@ -43,7 +43,7 @@ def check(gate: Gate, now: int) -> None:
     if gate.state in HELD and gate.state not in NO_PORT and gate.state is not State.QUIET_BLOCKED:
         assert gate.due <= now + LASTING_NS, "every wait has a deadline"
     if gate.state is State.SLOW:
-        assert gate.due <= max(now, gate.limit.quarter_due)
+        assert gate.due <= max(now, gate.limit_due)
 
 
 def recover(gate: Gate, now: int) -> int:
@@ -52,7 +52,7 @@ def recover(gate: Gate, now: int) -> int:
     if gate.state in (State.CLOSED, State.OPENING, State.LOST):
         gate.opened(7, now)
     if gate.is_off:
-        gate.left_bus_off(True, False, now)
+        gate.left_bus_off(gate.under_way.count, True, False, now)
     gate.quiet(False, now)
     while gate.state not in PASSING:
         assert now - begin < 3 * SECOND, gate.state
@@ -151,19 +151,18 @@ def test_limit_of_a_slow_bus_halves_and_grows() -> None:
     assert gate.room(51 * MS) == 0, "a frame is late"
     gate.look(15, 0, 60 * MS)
     assert gate.room(60 * MS) == 3
-    gate.advance(101 * MS)
-    assert gate.limit.frames == 4
-    gate.accepted(4, 101 * MS)
-    gate.look(16, 0, 152 * MS)
-    gate.advance(152 * MS)
-    assert gate.limit.frames == 2
-    gate.look(19, 0, 160 * MS)
-    now = 160 * MS
+    gate.advance(150 * MS)
+    assert gate.limit.frames == 3
+    gate.advance(151 * MS)
+    assert gate.limit.frames == 1, "a frame was late at 60 ms, although it has left since"
+    gate.advance(251 * MS)
+    assert gate.limit.frames == 2, "no frame was late for half of the timeout"
+    now = 251 * MS
     while gate.state is State.SLOW:
         now += 50 * MS
         gate.advance(now)
     assert gate.room(now) == UNLIMITED
-    assert now < 2 * SECOND
+    assert now < 4 * SECOND
 
 
 def test_frames_of_another_program_do_not_count_as_own_departures() -> None:
@@ -206,7 +205,7 @@ def test_request_in_a_bus_off_of_a_parked_vehicle_leaves_the_bus_off_as_it_is() 
     gate.advance(RESTART_AFTER)
     gate.quiet(True, 600 * MS)
     gate.request(700 * MS)
-    assert gate.left_bus_off(is_running=True, is_reported=False, now=800 * MS)
+    assert gate.left_bus_off(7, is_running=True, is_reported=False, now=800 * MS)
 
 
 def test_frame_that_the_driver_lost_does_not_block_a_gateway_without_a_first_frame() -> None:
@@ -234,3 +233,40 @@ def test_blocked_bus_is_no_fault_of_a_parked_vehicle() -> None:
     assert gate.is_stalled
     gate.quiet(True, 2 * SECOND)
     assert not gate.is_stalled
+
+
+def test_frames_that_left_before_a_bus_off_do_not_prove_the_first_frame() -> None:
+    gate = Gate(TIMEOUT)
+    gate.opened(0, 0)
+    gate.accepted(3, 0)
+    gate.bus_off(stays=False, now=10 * MS)
+    gate.left_bus_off(3, is_running=True, is_reported=False, now=SECOND)
+    gate.accepted_first(SECOND)
+    gate.look(3, 0, SECOND)
+    assert gate.room(SECOND) == 0
+
+
+def test_end_of_a_long_bus_off_asks_for_no_restart() -> None:
+    gate = Gate(TIMEOUT, RESTART_AFTER)
+    gate.opened(0, 0)
+    gate.bus_off(stays=False, now=0)
+    now = 2 * RESTART_AFTER
+    gate.left_bus_off(0, is_running=True, is_reported=False, now=now)
+    gate.advance(now)
+    assert Act.ASK not in gate.acts
+    assert not gate.is_stalled
+
+
+@pytest.mark.parametrize("is_quiet", [False, True])
+def test_restart_is_asked_for_only_after_a_look(is_quiet: bool) -> None:
+    gate = Gate(TIMEOUT, RESTART_AFTER)
+    gate.opened(0, 0)
+    gate.quiet(is_quiet, 0)
+    gate.accepted(3, 0)
+    now = 0
+    while Act.ASK not in gate.acts and now < 3 * SECOND:
+        if now >= gate.look_due:
+            gate.look(0, 0, now)
+        gate.advance(now)
+        now = max(now + 1, min(gate.due, gate.look_due))
+    assert gate.under_way.looked == gate.restart.asked

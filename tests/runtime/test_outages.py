@@ -29,6 +29,7 @@ from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime.can.link_monitor import LinkFacts
 from kontronik_can_gw.runtime.loop import Loop
 from kontronik_can_gw.signals.plan import MessageLayout
+from kontronik_can_gw.status import CanState
 from kontronik_can_gw.times import MS, SECOND
 
 pytestmark = pytest.mark.promise("after-outage")
@@ -198,7 +199,7 @@ def test_first_frame_carries_no_measurement(
     begin = len(it.bus.sent)
     it.loop.can.gate.bus_off(False, it.world.now)
     it.loop.can.transmitter.work(it.world.now)
-    it.loop.can.gate.left_bus_off(is_running=True, is_reported=False, now=it.world.now)
+    it.loop.can.gate.left_bus_off(it.bus.frames_left(), True, False, it.world.now)
     it.run(SECOND)
     frame = it.bus.sent[begin][1]
     assert frame.can_id == first[0]
@@ -267,3 +268,25 @@ def test_recording_that_begins_in_an_outage_holds_frames_in_its_replay() -> None
     replayed = Gateway(settings, 0)
     Replay(replayed, state_of(gateway))
     assert replayed.is_held
+
+
+@in_both_cores
+@pytest.mark.parametrize("phase_ms", [0, 7, 13, 17, 22])
+def test_bus_that_is_blocked_after_bus_off_gets_no_measurement(
+    phase_ms: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames that left just before the bus-off are not taken for the first frame."""
+    it = Recorded(monkeypatch, with_status())
+    it.run(SECOND + phase_ms * MS)
+    it.bus.discard_waiting()
+    it.bus.block()
+    it.bus.state = CanState.BUS_OFF
+    it.bus.came(0x7FF)
+    it.run(300 * MS)
+    begin = len(it.bus.sent)
+    it.bus.state = CanState.ERROR_ACTIVE
+    it.bus.came(0x7FF)
+    it.run(1500 * MS)
+    handed_over = it.bus.sent[begin:]
+    assert handed_over
+    assert not [each for each in handed_over if age_of(it.world, *each) is not None]

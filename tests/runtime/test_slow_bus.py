@@ -6,9 +6,10 @@ import pytest
 from dbc_bench import compiled
 from packer_oracle import Msg, dbc_text
 from test_outages import TIMEOUT, Recorded, age_of, in_both_cores, nodes, on_the_wire, with_status
-from wire_world import TIMES, speed_and_age
+from wire_world import TIMES, run, speed_and_age
 
 from kontronik_can_gw.capture.format import EntryKind
+from kontronik_can_gw.core.output_setup import OutputMaker
 from kontronik_can_gw.gateway.gate_table import State
 from kontronik_can_gw.times import MS, SECOND
 
@@ -40,7 +41,7 @@ def test_no_value_that_leaves_a_slow_bus_is_old(rate: int, monkeypatch: pytest.M
     if rate <= 40:
         assert it.loop.can.gate.is_slow
     it.bus.frame_ns = MS // 4
-    it.run(3 * SECOND)
+    it.run(5 * SECOND)
     assert not it.loop.can.gate.is_slow
     assert it.loop.can.gate.state is State.OPEN
     it.loop.end()
@@ -91,7 +92,50 @@ def test_slow_bus_is_reported_once_and_its_end_too(
     lines = [line for line in caplog.messages if "CAN world" in line and "open" not in line]
     assert [line.split(":")[1].split(".")[0] for line in lines] == [
         " the bus is slow",
-        " the bus takes all frames in time, after 10",
+        " the bus takes all frames in time, after 12",
     ]
     boot_ups = [at for at, frame in it.bus.arrived if frame[:2] == (0x701, b"\0")]
     assert len(boot_ups) <= 1, "no node boots"
+
+
+@in_both_cores
+@pytest.mark.parametrize("rate", [28, 20, 10, 5])
+@pytest.mark.parametrize("outputs", [[], [nodes()]], ids=["DBC", "with nodes"])
+def test_no_value_is_too_old_if_it_is_old_when_it_is_handed_over(
+    rate: int, outputs: list[OutputMaker], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With telemetry each 240 ms, values are up to 240 ms old when they are packed."""
+    it = Recorded(monkeypatch, with_status(), outputs)
+    it.run(SECOND)
+    frame_ns = SECOND // rate
+    it.bus.frame_ns = frame_ns
+    it.run(8 * frame_ns)
+    it.bus.frames_left()
+    begin = len(it.bus.arrived)
+    now = it.world.now
+    it.world.wires[0].stream(now + 5 * MS, now + 20 * SECOND, 240 * MS)
+    run(it.loop, it.world, now + 20 * SECOND)
+    it.bus.frames_left()
+    arrived = it.bus.arrived[begin:]
+    ages = [age for each in arrived if (age := age_of(it.world, *each)) is not None]
+    assert max(ages) <= TIMEOUT + QUARTER + frame_ns
+
+
+@in_both_cores
+@pytest.mark.parametrize("rate", [4, 3, 2])
+def test_values_leave_a_bus_with_few_frames_a_second(
+    rate: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame takes longer than the time after which a bus is blocked, but frames leave."""
+    it = Recorded(monkeypatch, with_status(), [nodes()])
+    it.run(SECOND)
+    it.bus.frame_ns = SECOND // rate
+    it.run(5 * SECOND)
+    it.bus.frames_left()
+    begin = len(it.bus.arrived)
+    it.run(10 * SECOND)
+    it.bus.frames_left()
+    ages = [age for each in it.bus.arrived[begin:] if (age := age_of(it.world, *each)) is not None]
+    assert len(ages) >= rate
+    assert max(ages) <= TIMEOUT + QUARTER + SECOND // rate
+    assert it.loop.can.gate.is_slow

@@ -130,7 +130,7 @@ class CanController:
         if port.state is status.can_state:
             return
         if self.is_off and port.state is not CanState.BUS_OFF:
-            if not self._has_restarted(now):
+            if not self._has_restarted(port.frames_left(), now):
                 return
             self._restarted_ns = now
         self.is_off = port.state is CanState.BUS_OFF
@@ -150,7 +150,7 @@ class CanController:
             word = name_in_words(port.state.name)
             self._conditions.end(self.condition, f"{name}: {word}", now)
 
-    def _has_restarted(self, now: int) -> bool:
+    def _has_restarted(self, count: int, now: int) -> bool:
         """Return True if a controller that left bus-off accepts frames again.
 
         Frames that are sent earlier are lost without an error. The kernel first reports
@@ -160,12 +160,12 @@ class CanController:
         self.refresh(now)
         facts = self.facts
         if facts is None:
-            return self._gate.left_bus_off(is_running=True, is_reported=False, now=now)
+            return self._gate.left_bus_off(count, True, False, now)
         is_running = facts.up and facts.running
         is_reported = facts.state is CanState.BUS_OFF
         if is_running and is_reported:
             self.due = now + ASK_RESTARTING_NS
-        return self._gate.left_bus_off(is_running, is_reported, now)
+        return self._gate.left_bus_off(count, is_running, is_reported, now)
 
     def _follow_bitrate(self, bitrate: int | None, now: int) -> None:
         if not bitrate:

@@ -157,6 +157,7 @@ class Transmitter:
         frames = self.queue.in_order()
         if not frames:
             gate.refused_since = NEVER
+            gate.made_room()
             return None
         count, answer = port.send_all(frames[:most], self._clock, now + self.max_turn_ns)
         self.queue.remove(frames, count)
