@@ -385,6 +385,7 @@ class _CanFaults:
                     node.emergencies.pulse(ended, now)
             else:
                 node.producer.beat(now)
+                node.producer.advance(now)  # before the emergencies
                 node.repeat(now, ended)
         self._is_on = True
         self._was_off = False

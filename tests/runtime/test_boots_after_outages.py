@@ -24,13 +24,13 @@ PERIOD_MS = 1000
 in_both_cores = pytest.mark.parametrize("core_language", ["C", "Python"], indirect=True)
 
 
-def names(frames: list[tuple[int, bytes]]) -> list[str]:
-    """Return the frames of node 1 as "boot-up", "heartbeat", an emergency's code, or "PDO"."""
+def names(frames: list[tuple[int, bytes]], node: int = 1) -> list[str]:
+    """Return the frames of a node as "boot-up", "heartbeat", an emergency's code, or "PDO"."""
     found = []
     for can_id, data in frames:
-        if can_id == 0x701:
+        if can_id == 0x700 + node:
             found.append("heartbeat" if data[0] else "boot-up")
-        elif can_id == 0x081:
+        elif can_id == 0x080 + node:
             found.append(data[1::-1].hex())
     return found
 
@@ -55,8 +55,8 @@ class Outage(Bench):
                 self.turn(2)
         self.take()
 
-    def after(self, cause: str, phase_ms: int = 0) -> list[str]:
-        """Return the names of the frames of node 1 in the 0.4 s after an outage."""
+    def after(self, cause: str, phase_ms: int = 0, node: int = 1) -> list[str]:
+        """Return the names of the frames of a node in the 0.4 s after an outage."""
         self.turn(phase_ms)
         if cause == "bus-off":
             self.goes_off()
@@ -77,7 +77,7 @@ class Outage(Bench):
             self.port.frames_left()
             self.take()
         self.turn(400)
-        return names(self.take())
+        return names(self.take(), node)
 
 
 @in_both_cores
@@ -93,6 +93,7 @@ class Outage(Bench):
     ],
 )
 @pytest.mark.parametrize("phase_ms", range(0, 1000, 100))
+@pytest.mark.parametrize("node", range(1, NODES + 1))
 def test_node_boots_once_and_its_boot_up_is_its_first_frame(
     kernel: Kernel,  # noqa: F811
     cause: str,
@@ -100,9 +101,10 @@ def test_node_boots_once_and_its_boot_up_is_its_first_frame(
     first: str,
     emergencies: list[str],
     phase_ms: int,
+    node: int,
 ) -> None:
     bench = Outage(kernel, behaviour)
-    frames = bench.after(cause, phase_ms)
+    frames = bench.after(cause, phase_ms, node)
     assert frames[0] == first
     assert frames.count("boot-up") == (first == "boot-up")
     assert [name for name in frames if len(name) == 4] == emergencies

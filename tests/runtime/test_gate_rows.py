@@ -31,6 +31,7 @@ from kontronik_can_gw.native import load
 from kontronik_can_gw.runtime.can.can_port import CanPort
 from kontronik_can_gw.runtime.can.transmitter import Transmitter
 from kontronik_can_gw.runtime.system.fault_log import FaultLog
+from kontronik_can_gw.times import MS, NEVER
 
 pytestmark = pytest.mark.promise("gate", "replay")
 
@@ -215,3 +216,23 @@ def test_all_rows_and_pairs_send_the_same_in_both_cores_and_a_replay(
 
 def ignore(_gate: object, _now: int) -> None:
     """Check nothing. tests/gateway/test_gate.py checks the states."""
+
+
+def test_quiet_mode_after_a_busy_port_leaves_no_deadline_in_the_past() -> None:
+    drive = Drive()
+    gate = drive.gate
+    transmitter = drive.transmitter
+    gate.opened(0, BEGIN)
+    transmitter.work(BEGIN)
+    drive.port.room, drive.port.answer = 0, Sent.BUSY
+    drive.now = BEGIN + 20 * MS
+    drive.gateway.receive_bytes(0, live(1), drive.now, drive.now)
+    drive.gateway.advance(drive.now)
+    transmitter.transmit(drive.port, drive.now)
+    assert gate.refused_since != NEVER
+    drive.gateway.status.is_quiet = True
+    drive.port.room, drive.port.answer = 99, Sent.OK
+    for _ in range(3):
+        drive.now += 10 * MS
+        transmitter.transmit(drive.port, drive.now)
+    assert gate.due > drive.now
