@@ -9,6 +9,7 @@ from kontronik_can_gw.gateway.gate_table import (
     MAX_PAUSE_NS,
     NO_FIRST_NS,
     SETTLING_NS,
+    SOON_NS,
     UNLIMITED,
     WORKED_NS,
     Act,
@@ -136,15 +137,12 @@ def _has_first_left(gate: GateState, now: int) -> bool:
     """Return True if the first frame has left.
 
     Frames that were accepted before it leave first. If the driver has lost some of them, the
-    count stays too low. Then the first frame is taken as sent LASTING_NS after another one, unless
-    it still waits in the kernel's queue.
+    count stays too low. Then the first frame has left SOON_NS after another one, unless it
+    still waits in the kernel's queue.
     """
     if gate.first.at == NEVER or gate.queued:
         return False
-    under_way = gate.under_way
-    if not under_way.frames or under_way.count >= gate.first.count:
-        return True
-    return gate.first.moves_since != NEVER and now - gate.still_since >= LASTING_NS
+    return gate.under_way.count >= gate.first.count or now - gate.first.moves_since >= SOON_NS
 
 
 def _has_first_left_slowly(gate: GateState, now: int) -> bool:

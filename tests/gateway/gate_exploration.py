@@ -26,6 +26,7 @@ from kontronik_can_gw.gateway.gate_table import (
     NO_PORT,
     PASSING,
     SETTLING_NS,
+    SOON_NS,
     UNLIMITED,
     WORKED_NS,
     Act,
@@ -107,7 +108,7 @@ def limits(gate: Gate) -> dict[str, int]:
         if first.at != NEVER:
             found["repeat"] = first.at + LASTING_NS
         if first.moves_since != NEVER:
-            found["moved"] = gate.still_since + LASTING_NS
+            found["moved"] = first.moves_since + SOON_NS
             found["slowly"] = first.moves_since + TIMEOUT // 4 + 1
     if state in HELD and state not in NO_PORT:
         if not gate.is_stalled or state is State.MOVING:

@@ -122,7 +122,7 @@ def test_adapter_with_a_buffer_of_its_own_is_restarted_ever_more_rarely(
     is_free_at_times: bool,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """It takes three frames after each restart, and when the bus is free for 20 ms, and hangs."""
+    """It takes three frames after each restart, or when the bus is free for 20 ms, and hangs."""
     caplog.set_level(logging.INFO, "kontronik_can_gw")
     it = Hung(kernel)
     it.hang()
@@ -137,8 +137,7 @@ def test_adapter_with_a_buffer_of_its_own_is_restarted_ever_more_rarely(
         if is_free_at_times and turn % 600 == 0:
             it.bench.port.passes += 3
     assert 1 <= len(it.asked) <= 6, "after 0.5, 1, 2, 4 and 8 s"
-    works = [line for line in caplog.messages if "works again" in line]
-    assert len(works) <= is_free_at_times, "frames leave a bus that is free at times: it is slow"
+    assert not [line for line in caplog.messages if "works again" in line]
 
 
 @pytest.mark.parametrize(("after_s", "interface"), [(0, "socketcan"), (0.5, "virtual")])

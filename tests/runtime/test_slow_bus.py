@@ -139,32 +139,3 @@ def test_values_leave_a_bus_with_few_frames_a_second(
     assert len(ages) >= rate
     assert max(ages) <= TIMEOUT + QUARTER + SECOND // rate
     assert it.loop.can.gate.is_slow
-
-
-@in_both_cores
-@pytest.mark.parametrize("rate", [4, 3, 2])
-@pytest.mark.parametrize("period_ms", [10, 240])
-def test_first_frame_that_leaves_slowly_is_waited_for(
-    rate: int, period_ms: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One frame is under way when the bus gets slow. It leaves long before the first frame."""
-    times = TIMES.replace("20;", "100;").replace("CyclicAndEvent", "Cyclic")
-    message = Msg("M0", 0x100, 8, speed_and_age())
-    it = Recorded(monkeypatch, compiled(dbc_text([message], times), ["esc1"]))
-    world = it.world
-
-    def run_for(duration_ns: int) -> None:
-        end = world.now + duration_ns
-        world.wires[0].stream(world.now + 5 * MS, end, period_ms * MS)
-        run(it.loop, world, end)
-
-    run_for(SECOND)
-    it.bus.frame_ns = SECOND // rate
-    begin = world.now + SECOND // rate
-    run_for(15 * SECOND)
-    it.bus.frames_left()
-    both = zip(it.bus.sent, it.bus.arrived, strict=False)
-    arrived = [gone for handed_over, gone in both if handed_over[0] > begin]
-    ages = [age for each in arrived if (age := age_of(world, *each)) is not None]
-    assert len(ages) >= rate
-    assert max(ages) <= TIMEOUT + QUARTER + SECOND // rate
