@@ -163,7 +163,7 @@ def _move(frames: int, queued: int) -> Step:
 
 
 def _let_grow(gate: Gate, now: int) -> None:
-    """Let all frames leave, and quarters pass until the limit is the highest."""
+    """Let all frames leave, and time pass until the limit is the highest."""
     gate.look(gate.under_way.count + max(1, gate.under_way.frames), 0, now)
     while gate.limit.frames < UNLIMITED - 1:
         gate.limit.late = gate.limit.changed = now - TIMEOUT // 2
@@ -192,7 +192,7 @@ _OF_ALL: dict[str, Step] = {
     "stop": lambda gate, now: gate.stop(now),
     "time": lambda gate, now: gate.advance(now),
 }
-_OF_SLOW: dict[str, Step] = {"all left, quarters pass": lambda gate, now: _let_grow(gate, now)}
+_OF_SLOW: dict[str, Step] = {"all left, time passes": lambda gate, now: _let_grow(gate, now)}
 _OF_OPEN: dict[str, Step] = {
     "lost": lambda gate, now: gate.lost(False, now),
     "down": lambda gate, now: gate.lost(True, now),

@@ -199,7 +199,9 @@ def test_first_frame_carries_no_measurement(
     begin = len(it.bus.sent)
     it.loop.can.gate.bus_off(False, it.world.now)
     it.loop.can.transmitter.work(it.world.now)
-    it.loop.can.gate.left_bus_off(it.bus.frames_left(), True, False, it.world.now)
+    it.loop.can.gate.left_bus_off(
+        it.bus.frames_left(), is_running=True, is_reported=False, now=it.world.now
+    )
     it.run(SECOND)
     frame = it.bus.sent[begin][1]
     assert frame.can_id == first[0]

@@ -160,7 +160,7 @@ class CanController:
         self.refresh(now)
         facts = self.facts
         if facts is None:
-            return self._gate.left_bus_off(count, True, False, now)
+            return self._gate.left_bus_off(count, is_running=True, is_reported=False, now=now)
         is_running = facts.up and facts.running
         is_reported = facts.state is CanState.BUS_OFF
         if is_running and is_reported:
